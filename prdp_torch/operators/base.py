@@ -93,8 +93,8 @@ class Operator:
         return diagonal
 
     def dense(self, dtype: torch.dtype = torch.float64) -> Tensor:
-        """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples. Only for small n: ValueError if
-        it would not fit into the memory of the machine."""
+        """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples, in float64 unless `dtype` says
+        otherwise. Only for small n: ValueError if it would not fit into the memory of the machine."""
         self._check_dense_fits(dtype)
         matrix: Tensor = torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
         return matrix

@@ -50,7 +50,10 @@ std::shared_ptr<const RegisteredProducts> RegisteredProducts::find(int64_t numbe
     const auto entry = registry().entries.find(number);
     if (entry != registry().entries.end()) found = entry->second.lock();
   }
-  TORCH_CHECK_VALUE(found, "Function: the operator no longer exists");
+  TORCH_CHECK_VALUE(
+      found,
+      "Function: the operator no longer exists; keep it, and make it outside of what torch.func.linearize or "
+      "torch.compile runs");
   return found;
 }
 
