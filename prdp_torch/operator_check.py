@@ -238,4 +238,5 @@ def _ritz_values(M: Operator, v: Tensor) -> Tensor:
         length = _norm(product)
         q = torch.where((length > rounding * largest)[:, None], product / length[:, None], 0.0)
     projected = basis @ torch.stack(products, 2)
-    return torch.linalg.eigvalsh((projected + projected.mT) / 2)
+    values: Tensor = torch.linalg.eigvalsh((projected + projected.mT) / 2)
+    return values

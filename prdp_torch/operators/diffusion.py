@@ -37,8 +37,9 @@ class Diffusion(Operator):
             (batch, 1) in 1D, (batch, 1, 1) in 2D. With 1/dt, A is a step of ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with
             b = u/dt. In float32 products are made of fluxes: for `CG` and `Direct` a small shift, weak sides and jumps
             of κ are not lost in the rounding of a diagonal, though the residual may end at ε max κ Σ 2/dx² |u|, with a
-            warning. `Direct` ends with BREAKDOWN where κ/dx² is 1e13 times as large as what holds u. `MINRES` and
-            `GMRES`, which go by the residual, and the coarse grids of multigrid do lose what holds u by less than that.
+            warning. `Direct` ends with BREAKDOWN where its factors lose what holds u, from κ/dx² = 1e13 times that on.
+            `MINRES` and `GMRES`, which go by the residual, and the coarse grids of multigrid do lose what holds u by
+            less than that.
         boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes), "periodic", or
             ("robin", h) with h >= 0 (what flows out, -κ ∂u/∂n with the normal n pointing outwards, is h u on the side):
             one for all sides, one for each axis, or a pair (low, high) for each axis. h is a number, or a tensor

@@ -133,7 +133,7 @@ def test_operators_of_numbers_are_made_inside_a_graph():
     torch.testing.assert_close(compiled(b), solve(b), rtol=0.0, atol=0.0)
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.trace")
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace", "ignore::torch.jit.TracerWarning")
 def test_torch_export_records_a_step_and_torch_jit_trace_says_that_it_cannot():
     step, u = prdp.Heat((8,), 0.3, 0.1, prdp.CG(20)), field((8,))
     exported = torch.export.export(torch.nn.Sequential(step), (u,)).module()
@@ -142,3 +142,6 @@ def test_torch_export_records_a_step_and_torch_jit_trace_says_that_it_cannot():
     for run in (step, lambda b: prdp.linear_solve(heat, b, prdp.CG(20))[0]):
         with pytest.raises(TypeError, match="trace cannot record a solve of prdp_torch"):
             torch.jit.trace(run, u)
+    flow = prdp.Flow((8, 8), 0.01, 0.01)
+    with torch.no_grad(), pytest.raises(TypeError, match="trace cannot record it"):
+        torch.jit.trace(flow, torch.zeros(1, 2, 8, 8, dtype=torch.float64))

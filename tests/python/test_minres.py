@@ -189,6 +189,21 @@ def test_many_products_in_vain_name_the_asymmetry_though_no_residual_grew():
     assert not info.solved.any() and (info.residual < 1).all()
 
 
+@pytest.mark.filterwarnings("ignore:.* STAGNATED far above rtol", "error:.*not symmetric")
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("method", [prdp.CG, prdp.MINRES])
+def test_a_symmetric_derivative_by_differences_is_not_called_asymmetric(method, dtype):
+    s, u = noise(24, 24).to(dtype), noise(2, 24, seed=1).to(dtype)
+    s = s + s.T + 24 * torch.eye(24, dtype=dtype)
+    h = torch.finfo(dtype).eps ** 0.5
+
+    def function(x):
+        return x @ s + x**3
+
+    a = operators.Function(lambda v: (function(u + h * v) - function(u)) / h, symmetric=True)
+    prdp.linear_solve(a, noise(2, 24, seed=2).to(dtype), method(150, 1e-13), backward="none")
+
+
 @pytest.mark.parametrize("rtol", [0.0, 1e-9])
 @pytest.mark.parametrize("preconditioner", [None, "diagonal"])
 def test_tensors_and_other_devices_give_what_the_loops_give(rtol, preconditioner):

@@ -168,7 +168,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     return number(Kind::kSquare, rr, r.version);
   }
   void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
-  std::array<bool, 1> definite_factors() const { return {false}; }
+  std::array<bool, 1> definite_factors(const Vector&) const { return {false}; }
   Scalar skeel_estimate2(const Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
 
   Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2) {

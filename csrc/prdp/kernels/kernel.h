@@ -34,8 +34,7 @@ struct GridOperator {
 template <class T>
 class Preconditioner;
 
-/// Where the rows of a matrix differ by more, its factors in float64 lose what couples the small ones; and where its
-/// diagonal is that much larger than its row sums, what holds the constant.
+/// Where the rows of a matrix differ by more, its factors in float64 lose what couples the small ones.
 inline constexpr double kWidestRowsOfFactors = 1e13;
 
 /// A on one sample in padded memory: everything that the CPU loops know of an operator. It may be used by several
@@ -58,8 +57,9 @@ class Kernel {
   virtual double norm() const = 0;
   /// Whether A is known to be positive definite, and rounding does not change that.
   virtual bool is_surely_definite() const { return false; }
-  /// Whether its factors in float64 are, too: see kWidestRowsOfFactors.
-  virtual bool has_definite_factors() const { return false; }
+  /// Whether its factors in float64 are, too, which x was made by: not where its rows differ by kWidestRowsOfFactors,
+  /// nor where the factors have lost what holds the constant.
+  virtual bool has_definite_factors(const T* /*x*/, const T* /*b*/) const { return false; }
   /// Multiplications of a product.
   virtual int64_t work() const { return unknowns(); }
   /// out = A v

@@ -80,19 +80,27 @@ class PackedStencil {
     const auto [least, most] = std::minmax_element(row_sums_.begin(), row_sums_.end());
     return *least >= T(0) && *most > T(0);
   }
-  /// The largest entry on the diagonal over the smallest; or all of the diagonal over all row sums, which hold the
-  /// constant, if that is more. Needs row sums.
+  /// The largest entry on the diagonal over the smallest.
   double spread() const {
-    double least = std::numeric_limits<double>::infinity(), most = 0.0, all = 0.0, held = 0.0;
+    double least = std::numeric_limits<double>::infinity(), most = 0.0;
     for (int64_t r = 0; r < rows(); ++r)
       for (int64_t i = 0; i < nx_; ++i) {
         const double size = std::abs(diagonal(r, i));
         least = std::min(least, size);
         most = std::max(most, size);
-        all += size;
-        held += row_sum(r, i);
       }
-    return std::max(most / least, all / held);
+    return most / least;
+  }
+  /// Whether the sums of A x and b over the grid agree to a few thousandths of Σ|b|. That of A x is Σ (row sum) x, as A
+  /// is symmetric where it has row sums.
+  bool sums_agree(const T* x, const T* b) const {
+    double sum = 0.0, size = 0.0;
+    for (int64_t r = 0; r < rows(); ++r)
+      for (int64_t i = 0; i < nx_; ++i) {
+        sum += row_sum(r, i) * static_cast<double>(x[r * row_ + i]) - static_cast<double>(b[r * row_ + i]);
+        size += std::abs(static_cast<double>(b[r * row_ + i]));
+      }
+    return std::abs(sum) <= 2e-3 * size;
   }
   double row_sum(int64_t r, int64_t i) const { return static_cast<double>(row_sums_[r * row_sum_step_ + i]); }
   /// The entry of the matrix on its diagonal at point i of row r.

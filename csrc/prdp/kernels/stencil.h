@@ -33,8 +33,12 @@ class Stencil final : public Kernel<T> {
   const PackedStencil<T>& coefficients() const { return coefficients_; }
   double norm() const override { return coefficients_.norm(); }
   bool is_surely_definite() const override { return !this->null_space() && coefficients_.is_surely_definite(); }
-  bool has_definite_factors() const override {
-    return is_surely_definite() && coefficients_.spread() < kWidestRowsOfFactors;
+  bool has_definite_factors(const T* x, const T* b) const override {
+    if (!is_surely_definite() || coefficients_.spread() >= kWidestRowsOfFactors) return false;
+    const int64_t plane = layout().rows * layout().row;
+    for (int64_t channel = 0; channel < channels(); ++channel)
+      if (!coefficients_.sums_agree(x + channel * plane, b + channel * plane)) return false;
+    return true;
   }
 
   void apply(const T* v, T* out) const override {

@@ -4,13 +4,11 @@
 
 #include "prdp/gpu/operator_view.h"
 #include "prdp/gpu/part_of.h"
-#include "prdp/gpu/runtime.h"
 #include "prdp/kernels/matrix.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/matrix_checks.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/product_rule_kernels.h"
-#include "prdp/operators/transposed_pattern.h"
 
 namespace prdp {
 
@@ -36,7 +34,7 @@ void check_rows(const int64_t* crow, const int64_t* col, int64_t n, int64_t stor
 
 CsrOperator::CsrOperator(const OperatorSpec& spec) {
   TORCH_CHECK_VALUE(spec.tensors.size() == 3, "csr: takes three tensors, crow, col and values");
-  const auto &crow = given_crow_ = spec.tensors[0], &col = given_col_ = spec.tensors[1];
+  const auto &crow = spec.tensors[0], &col = spec.tensors[1];
   values_ = spec.tensors[2];
   TORCH_CHECK_VALUE(values_.dim() == 1 || values_.dim() == 2,
                     "linear_solve: A must have shape (n, n) or (batch, n, n)");
@@ -194,8 +192,6 @@ std::unique_ptr<Operator> CsrOperator::select(const at::Tensor& index) const {
   chosen->crow_ = crow_.index_select(0, index);
   chosen->col_ = col_.index_select(0, index);
   chosen->values_ = values_.index_select(0, index);
-  chosen->given_crow_ = chosen->crow_;
-  chosen->given_col_ = chosen->col_;
   chosen->rows_ = at::Tensor();
   chosen->drop_axis_of_one();
   return chosen;
@@ -220,14 +216,15 @@ std::shared_ptr<const kernels::Kernels> CsrOperator::kernels(const at::Tensor& b
 
 std::optional<gpu::OperatorView> CsrOperator::gpu_view(const at::Tensor& b, bool transposed) const {
   auto crow = shared_or_own(crow_), col = shared_or_own(col_), values = values_.contiguous();
-  if (transposed) {
-    auto* const runtime = gpu::runtime_of(b.device());
-    const auto of_rows = prdp::transposed({given_crow_, given_col_, crow, col},
-                                          /*may_keep=*/runtime && !runtime->is_capturing(b.device()));
-    crow = of_rows.crow;
-    col = of_rows.col;
-    const auto& order = of_rows.order;
-    values = values.gather(-1, order.dim() < values.dim() ? order.expand(values.sizes()) : order);
+  if (transposed) {  // columns as rows
+    col = col_.contiguous();
+    const auto order = col.argsort(/*stable=*/true, /*dim=*/-1, /*descending=*/false);
+    const auto along = [&](const at::Tensor& t) { return t.gather(-1, order); };
+    auto bounds = at::arange(n() + 1, crow.options());
+    if (col.dim() == 2) bounds = bounds.expand({col.size(0), -1}).contiguous();
+    crow = at::searchsorted(along(col), bounds);
+    col = along(rows());
+    values = along(values);
   }
   gpu::OperatorView view{"Csr<" + gpu::type_of(b.scalar_type()) + ", " + std::to_string(n()) + ">"};
   view.numbers = {static_cast<double>(values.size(-1))};

@@ -34,7 +34,6 @@ class CsrOperator final : public Operator {
   at::Tensor to_dense() const;
   void drop_axis_of_one();
 
-  at::Tensor given_crow_, given_col_;
   at::Tensor crow_, col_, values_;  // (…) or (batch, …)
   bool had_axis_of_one_ = false;           // values were (1, nnz)
   mutable at::Tensor rows_;

@@ -77,10 +77,10 @@ bool row_sums_are_rounding(const Operator& a, const at::Tensor& b, int64_t sampl
 }
 
 /// Why a method for symmetric definite operators fails on this one.
-std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
+std::string not_definite(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (b.scalar_type() == at::kFloat && row_sums_are_rounding(a, b, sample))
     return "what keeps A from being singular, such as its shift, is lost in the rounding of float32; take float64";
-  if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
+  if (auto found = asymmetric(role, a, b, sample); !found.empty()) return found;
   return "A is symmetric but not definite; take MINRES, or name all its null vectors (nullspace) if it is singular";
 }
 
@@ -97,22 +97,24 @@ bool maps_ones_to_zero(const Preconditioner& m, const at::Tensor& b, int64_t sam
 }
 
 /// Why MINRES finds no direction.
-std::string not_minimal(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+std::string not_minimal(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const auto& solver = role.solver;
   if (auto found = nonfinite_preconditioner(solver, b, sample); !found.empty()) return found;
   if (solver.preconditioner)
     return std::string(
                "v·M⁻¹ v is not positive for a vector v: its preconditioner is not positive definite, or A is "
                "singular") +
            (solver.preconditioner.is_operator() ? "" : "; take MINRES without it, or CG where A is negative definite");
-  if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
+  if (auto found = asymmetric(role, a, b, sample); !found.empty()) return found;
   return "A is singular, and b lies outside its range; take a b without that part";
 }
 
-std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+std::string diverged(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const auto& solver = role.solver;
   const auto made_for = traits(solver.method).made_for;
   if (made_for == MadeFor::kDominant)
     return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES";
-  if (made_for == MadeFor::kDefinite) return "the residual grew beyond ‖b‖: " + not_definite(a, b, sample);
+  if (made_for == MadeFor::kDefinite) return "the residual grew beyond ‖b‖: " + not_definite(role, a, b, sample);
   return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct";
 }
 
@@ -133,7 +135,8 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
          (single ? "take float64, or scale A and b" : "scale A and b");
 }
 
-std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+std::string breakdown(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const auto& solver = role.solver;
   if (traits(solver.method).is_direct)
     return std::string("A is singular") + (b.scalar_type() == at::kFloat ? " to float32; take float64, or" : ";") +
            " GMRES solves it for any b in the range of A, and Direct where all null vectors are named";
@@ -143,8 +146,8 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
                "or A is not") +
            in_language("; prdp.check_operator(A, b, solver) looks at both", "");
   if (traits(solver.method).made_for == MadeFor::kDefinite)
-    return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
-  if (traits(solver.method).made_for == MadeFor::kSymmetric) return not_minimal(solver, a, b, sample);
+    return "r·A r is zero for a residual r: " + not_definite(role, a, b, sample);
+  if (traits(solver.method).made_for == MadeFor::kSymmetric) return not_minimal(role, a, b, sample);
   if (maps_ones_to_zero(solver.preconditioner, b, sample))
     return "its preconditioner maps a vector of ones to zero; look at what M⁻¹ is made of";
   if (traits(solver.method).counts == Counts::kIterations) return "r·A r is zero for a residual r; take GMRES";
@@ -235,7 +238,7 @@ std::string inconsistent(const SolveRole& role, const Operator& a, const at::Ten
     const bool is_constant =
         norm_of(fields - fields.mean(1, /*keepdim=*/true)) <= std::sqrt(epsilon_of(b)) * norm_of(outside);
     return share + "b lies outside the range of A" +
-           (is_constant ? ", which maps the constant to zero; take the mean off b" : "; take a b without that part");
+           (is_constant ? "; take the mean off b" : "; take a b without that part");
   }
   if (role.adjoint)
     return share +
@@ -258,9 +261,9 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
     if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown || status == SolveStatus::kStagnated)
       if (auto scales = badly_scaled(role.solver, a, b, sample); !scales.empty()) return scales;
     switch (status) {
-      case SolveStatus::kDiverged: return diverged(role.solver, a, b, sample);
+      case SolveStatus::kDiverged: return diverged(role, a, b, sample);
       case SolveStatus::kOverflow: return overflow(role.solver, a, b, sample);
-      case SolveStatus::kBreakdown: return breakdown(role.solver, a, b, sample);
+      case SolveStatus::kBreakdown: return breakdown(role, a, b, sample);
       case SolveStatus::kZeroDiagonal: return zero_diagonal(role, a, b, sample);
       case SolveStatus::kInconsistent: return inconsistent(role, a, b, sample);
       case SolveStatus::kNonfiniteInput:

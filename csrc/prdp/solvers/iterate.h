@@ -126,7 +126,7 @@ void judge_numerical_singularity(Space& space, const Method& method, typename Sp
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
   if (!std::none_of(states.begin(), states.end(), is_doubtful)) {  // kernels have no any_of
     const auto floors = rounding_floors(space, method);
-    const auto definite = space.definite_factors();
+    const auto definite = space.definite_factors(method.x);
     bool asks_for_estimate = false;
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];

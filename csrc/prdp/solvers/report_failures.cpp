@@ -1,6 +1,7 @@
 #include <c10/util/Exception.h>
 
 #include <algorithm>
+#include <bit>
 #include <map>
 #include <mutex>
 #include <sstream>
@@ -9,6 +10,7 @@
 #include "prdp/error_text.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/failure_messages.h"
+#include "prdp/solvers/methods.h"
 #include "prdp/solvers/raise_or_warn.h"
 #include "prdp/solvers/unfit.h"
 
@@ -159,22 +161,32 @@ bool warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& 
   return true;
 }
 
+/// Whether this is the 1st, 2nd, 4th, 8th, … time, so that looks cost little however often they are asked for.
+bool should_look(const std::string& at) {
+  static std::mutex mutex;
+  static std::map<std::string, uint64_t> times;
+  const std::lock_guard lock(mutex);
+  return std::has_single_bit(++times[at]) || c10::WarningUtils::get_warnAlways();
+}
+
 /// Warns where many products did not lead to rtol, though no residual grew, as A or a preconditioner of one's own is
 /// not what the method is made for. Below so many, the products that tell would cost too much beside the solve.
 void warn_of_unfit(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                    const std::vector<int64_t>& unsolved) {
-  constexpr int64_t many = 100;
-  if (!(role.solver.rtol > 0.0)) return;
+  constexpr double many = 100.0;
+  const auto& s = role.solver;
+  if (!(s.rtol > 0.0) || steps_of(s.method, s.max_iter.expect_int(), s.restart) < many) return;
+  if (!should_look(key_of(role))) return;
   const auto residual = to_host<double>(info.residual, b.size(0)), floor = to_host<double>(info.floor, b.size(0));
   const auto products = to_host<int64_t>(info.operator_applications, b.size(0));
   const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
   const int64_t worst = *std::max_element(unsolved.begin(), unsolved.end(), worse);
-  const double bound = std::max(10.0 * role.solver.rtol, 10.0 * floor[worst]);
-  if (products[worst] < many || !(residual[worst] > bound)) return;
+  const double bound = 10.0 * std::max(s.rtol, floor[worst]);
+  if (static_cast<double>(products[worst]) < many || !(residual[worst] > bound)) return;
   if (unfit(role, a, b, worst).empty()) return;
   warn_once("unfit: " + key_of(role), residual[worst], [&](std::ostream& text) {
     text << name_of(role) << ": " << unsolved.size() << " of " << b.size(0)
-         << " samples did not reach rtol = " << role.solver.rtol << ": sample " << worst << " is at relative residual "
+         << " samples did not reach rtol = " << s.rtol << ": sample " << worst << " is at relative residual "
          << residual[worst] << " after " << products[worst] << " products with A, "
          << diagnosis(role, a, b, SolveStatus::kMaxIter, worst);
   });

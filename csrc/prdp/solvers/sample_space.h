@@ -195,7 +195,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     return largest;
   }
   std::array<bool, 1> surely_definite() const { return {system_.a().is_surely_definite()}; }
-  std::array<bool, 1> definite_factors() const { return {system_.a().has_definite_factors()}; }
+  std::array<bool, 1> definite_factors(Vector x) { return {system_.a().has_definite_factors(x, b())}; }
   void solve_directly(const T* r, Vector d) {
     if (system_.factors().solve(r, d)) return;
     broken_ = true;

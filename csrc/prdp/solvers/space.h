@@ -184,8 +184,8 @@ concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, 
   s.solve_directly(x, y);
   /// Estimates Skeel's ‖|A⁻¹| |A| |u|‖²; times ε² it is the square of the error of u that rounding of A causes.
   { s.skeel_estimate2(x) } -> std::same_as<typename S::Scalar>;
-  /// Whether the factors of A are positive definite for sure, of each sample.
-  s.definite_factors();
+  /// Whether the factors of A are positive definite for sure, of each sample, and x = A⁻¹ b has what A is held by.
+  s.definite_factors(x);
 };
 
 /// All that methods need.

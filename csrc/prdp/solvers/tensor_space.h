@@ -152,7 +152,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   std::vector<bool> broken() const;
   const std::vector<double>& operator_norm();
   std::vector<bool> surely_definite() const { return std::vector<bool>(states_.size()); }
-  std::vector<bool> definite_factors() const { return surely_definite(); }
+  std::vector<bool> definite_factors(const Vector&) const { return surely_definite(); }
   /// u = start + scale_of_a x: the solution for the A that is not scaled.
   Vector solution(const Vector& x) const;
   Scalar solution2(const Vector& x) const {

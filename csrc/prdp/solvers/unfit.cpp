@@ -9,6 +9,7 @@
 #include <sstream>
 
 #include "prdp/operators/probes.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 
@@ -41,6 +42,9 @@ double nonlinearity(const Operator& m, const at::Tensor& b, int64_t sample) {
   return norm_of(row(m.apply(-2.0 * v), sample) - doubled) / norm_of(doubled);
 }
 
+/// Functions may be made of differences, which are linear and symmetric but for so much.
+double rounding_of_differences(const at::Tensor& b) { return 32.0 * std::sqrt(epsilon_of(b)); }
+
 bool needs_symmetry(Method method) {
   const auto made_for = traits(method).made_for;
   return made_for == MadeFor::kDefinite || made_for == MadeFor::kSymmetric;
@@ -54,9 +58,9 @@ std::string number(double x) {
   return text.str();
 }
 
-std::string asymmetric(const Operator& a, const at::Tensor& b, int64_t sample) {
+std::string asymmetric(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const double share = asymmetry(a, b, sample);
-  if (!(share > 100.0 * epsilon_of(b))) return {};
+  if (!(share > (is_function(role.a) ? rounding_of_differences(b) : 100.0 * epsilon_of(b)))) return {};
   return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
 }
 
@@ -65,15 +69,14 @@ std::string unfit(const SolveRole& role, const Operator& a, const at::Tensor& b,
   const auto& solver = role.solver;
   const bool symmetric = needs_symmetry(solver.method);
   if (symmetric)
-    if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
+    if (auto found = asymmetric(role, a, b, sample); !found.empty()) return found;
   if (!solver.preconditioner.is_operator()) return {};
   const auto m = make_operator(solver.preconditioner.spec());
-  // One made of differences is linear but for their rounding.
-  if (nonlinearity(*m, b, sample) > 32.0 * std::sqrt(epsilon_of(b)))
+  if (nonlinearity(*m, b, sample) > rounding_of_differences(b))
     return "its preconditioner is not linear: M⁻¹(-2 v) is not -2 M⁻¹ v; a network is linear without biases and "
            "activations";
   const double share = symmetric ? asymmetry(*m, b, sample) : 0.0;
-  if (!(share > 32.0 * std::sqrt(epsilon_of(b)))) return {};
+  if (!(share > rounding_of_differences(b))) return {};
   return "its preconditioner is not symmetric (‖M⁻¹v - M⁻ᵀv‖ is " + number(share) +
          " ‖M⁻¹v‖ for a v of no structure); take GMRES";
 }

@@ -7,7 +7,7 @@
 namespace prdp {
 
 /// Where A is not symmetric: that, in words. Else empty.
-std::string asymmetric(const Operator& a, const at::Tensor& b, int64_t sample);
+std::string asymmetric(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample);
 
 /// Where the method needs A, or a preconditioner of one's own, to be symmetric, or the latter to be linear, and it is
 /// not: that, in words. Else empty.

@@ -209,7 +209,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   }
   void solve_directly(const T*, Vector) {}  // no method on a GPU does
   Scalar skeel_estimate2(const T*) const { return 0; }
-  std::array<bool, 1> definite_factors() const { return {false}; }
+  std::array<bool, 1> definite_factors(const Vector&) const { return {false}; }
 
   // ---- what iterate.h asks for
   std::array<double, 1> operator_norm() const { return {norm_}; }

@@ -1,5 +1,7 @@
 #include "prdp/steppers/flow/equation.h"
 
+#include <ATen/TracerMode.h>
+
 #include <cmath>
 
 #include "prdp/operators/plain_tensors.h"
@@ -110,6 +112,8 @@ void FlowEquation::check() const {
 }
 
 void FlowEquation::check(const at::Tensor& u) const {
+  TORCH_CHECK_TYPE(!at::tracer::impl::is_dispatch_enabled(),
+                   "Flow: torch.jit.trace cannot record it; take torch.compile");
   auto all = tensors();
   all.push_back(u);
   TORCH_CHECK_NOT_IMPLEMENTED(!in_torch_func() || !at::areAnyTensorSubclassLike(all),
