@@ -38,11 +38,16 @@ def load(scene: str | Path) -> _C.Scene:
 
 
 def _checked(scene: _C.Scene) -> _C.Scene:
-    """The scene, whose solver can be made: what the solver itself refuses is told with the file."""
+    """The scene, whose solver and steps can be made: what they themselves refuse is told with the file."""
     try:
         make_solver(scene, scene.max_iter)
     except ValueError as error:
         raise ValueError(f"{scene.path}: [solver]: {error}") from None
+    if scene.device.type == "cpu":
+        try:
+            make_stepper(scene)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{scene.path}: {error}") from None
     if scene.compare.rtol is not None and scene.compare.rtol >= 1:
         raise ValueError(f"{scene.path}: compare.rtol: must be < 1, got {scene.compare.rtol:g}")
     return scene

@@ -148,6 +148,19 @@ def test_what_the_solver_refuses_is_named_with_the_file(tmp_path, before, after,
         scenes.load(path)
 
 
+@pytest.mark.parametrize(
+    "scene, change, message",
+    [
+        ("burgers_1d", ("shape = [256]", "shape = [1]"), "Burgers: every extent of shape must be >= 2, got [1]"),
+        ("kolmogorov", ("[solver]", '[solver]\nstart = "state"'), "Flow: start must be 'zero'"),
+    ],
+)
+def test_what_the_step_refuses_is_named_with_the_file_before_any_work(tmp_path, scene, change, message):
+    path = written(tmp_path, change, scene=scene)
+    with pytest.raises(ValueError, match=re.escape(f"{path}: {message}")):
+        scenes.load(path)
+
+
 def test_missing_files_and_unknown_scenes():
     with pytest.raises(ValueError, match=r"scene: cannot read 'nowhere.toml'"):
         scenes.load("nowhere.toml")
