@@ -89,5 +89,6 @@ def print_table(scene: _C.Scene, table: list[Entry]) -> None:
     for entry in table:
         row = report.cells(scene, entry)
         shown.add_row(*(row[i] for i in kept), style="bold" if entry["kind"] in ("auto", "prdp") else None)
-    console.print(shown)
+    whole = console.measure(shown, options=console.options.update(width=1000)).maximum
+    Console(width=max(whole, console.width)).print(shown)  # else a narrow terminal cuts the ends off numbers
     console.print(report.notes(scene, kept))

@@ -52,6 +52,15 @@ def test_compare_prints_a_table_and_writes_records_and_a_report(comparison):
     assert by_label["converged"]["budget"] == 4 * 8 * 25 and by_label["constant_5"]["saved"] == pytest.approx(0.8)
 
 
+def test_a_narrow_terminal_cuts_no_number(comparison):
+    folder, _ = comparison
+    command = [*PRDP, "compare", "heat_1d", "--seeds", "2", "--intervals", "4", "--resume"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env={**os.environ, "COLUMNS": "50"})
+    rows = [line for line in done.stdout.splitlines() if re.match(r" K = \d", line)]
+    assert len(rows) > 5 and not any("…" in row for row in rows)
+    assert all(re.search(r"\de[+-]\d\d ±\de[+-]\d\d", row) for row in rows)
+
+
 def test_the_report_is_one_file_with_labelled_pictures(comparison):
     folder, _ = comparison
     html = (folder / "runs/heat_1d/report.html").read_text()
