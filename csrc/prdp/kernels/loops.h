@@ -180,9 +180,9 @@ struct Loops {
   void (*galerkin_product)(const GalerkinProduct<T>& c, int64_t step, int64_t n);
 
   void (*multiply)(const DenseProduct<T>& p);
-  /// P A = L U with partial pivoting, in the place of A, whose n columns follow each other. L has ones on its diagonal.
-  /// Row i of P A is row rows[i] of A.
-  void (*factor_lu)(double* a, int64_t n, int64_t* rows);
+  /// P A = L U with partial pivoting, in the place of A, whose n columns begin `stride` apart. L has ones on its
+  /// diagonal. Row i of P A is row rows[i] of A.
+  void (*factor_lu)(double* a, int64_t stride, int64_t n, int64_t* rows);
 
   /// out += the term, for a row of any n.
   void (*advect_row)(const AdvectionTerm<T>& t, const T* c, const T* w, T* out, int64_t n);

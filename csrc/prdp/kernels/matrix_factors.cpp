@@ -36,20 +36,23 @@ class DenseLU {
                &behind = transposed ? scales_->rows : scales_->columns;
     return behind.cwiseProduct(solve_factors(before.cwiseProduct(b), transposed));
   }
-  int64_t bytes() const { return lu_.rows() * lu_.rows() * static_cast<int64_t>(sizeof(double)); }
+  int64_t bytes() const { return memory_.size() * static_cast<int64_t>(sizeof(double)); }
 
  private:
   /// A pivot is rounding beside its own column: how large the others are does not matter.
-  void factor(Eigen::MatrixXd m) {
-    const double rounding = std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows());
+  void factor(const Eigen::MatrixXd& m) {
+    const int64_t n = m.rows();
+    const double rounding = std::numeric_limits<double>::epsilon() * static_cast<double>(n);
     const Eigen::ArrayXd sizes = m.cwiseAbs().colwise().sum();
-    lu_ = std::move(m);
-    loops<double>().factor_lu(lu_.data(), lu_.rows(), rows_.data());
-    is_regular_ = (lu_.diagonal().cwiseAbs().array() > rounding * sizes).all();
+    memory_.resize(n % 64 == 0 ? n + 8 : n, n);
+    memory_.topRows(n) = m;
+    loops<double>().factor_lu(memory_.data(), memory_.rows(), n, rows_.data());
+    is_regular_ = (memory_.diagonal().cwiseAbs().array() > rounding * sizes).all();
   }
   Eigen::VectorXd solve_factors(const Eigen::VectorXd& b, bool transposed) const {
-    const auto lower = lu_.triangularView<Eigen::UnitLower>();
-    const auto upper = lu_.triangularView<Eigen::Upper>();
+    const auto lu = memory_.topRows(memory_.cols());
+    const auto lower = lu.triangularView<Eigen::UnitLower>();
+    const auto upper = lu.triangularView<Eigen::Upper>();
     Eigen::VectorXd x = transposed ? b : b(rows_);
     if (!transposed) {
       lower.solveInPlace(x);
@@ -63,7 +66,7 @@ class DenseLU {
     return y;
   }
 
-  Eigen::MatrixXd lu_;
+  Eigen::MatrixXd memory_;  // L and U, with rows below them where columns would else compete for places in the cache
   std::vector<int64_t> rows_;  // of P
   std::optional<Equilibration> scales_;
   bool is_regular_ = false;
