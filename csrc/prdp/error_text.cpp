@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <atomic>
+#include <iomanip>
+#include <sstream>
 
 namespace prdp {
 
@@ -21,6 +23,12 @@ std::string sentence(std::string_view what) {
   std::string line(what);
   std::replace(line.begin(), line.end(), '\n', ' ');
   return line;
+}
+
+std::string three_digits(double x) {
+  std::ostringstream text;
+  text << std::setprecision(3) << x;
+  return text.str();
 }
 
 void speak_python() { speaks_python = true; }

@@ -7,6 +7,9 @@ namespace prdp {
 /// An error's words as the commands print them: one line, without the places in torch's source that it came from.
 std::string sentence(std::string_view what);
 
+/// A number as messages give it: "1.23", "4e-05".
+std::string three_digits(double x);
+
 /// Messages name things as their reader writes them: as in C++ until this is called, then as in Python and scenes.
 void speak_python();
 /// One of the two names.

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch._C import sentence
+from prdp_torch.advice_text import dtype_name
 from prdp_torch.experiments import _C, array_files, pdebench
 
 OnData: TypeAlias = Callable[[int, int], None]
@@ -126,10 +127,6 @@ def evaluating(network: object) -> Iterator[None]:
             module.training = mode
 
 
-def _name(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")
-
-
 def check_network(scene: _C.Scene, network: object, states: Tensor) -> None:
     """Raise TypeError or ValueError unless the network takes states of the scene to states, and can be trained."""
     if not isinstance(network, torch.nn.Module):
@@ -142,9 +139,13 @@ def check_network(scene: _C.Scene, network: object, states: Tensor) -> None:
     if other:
         has_complex = any(dtype.is_complex for dtype in other)
         raise ValueError(
-            f"train: the scene computes in {_name(scene.dtype)}, but network has parameters in "
-            f"{', '.join(sorted(map(_name, other)))}; "
-            + (f"make its complex ones {_name(wanted[True])}" if has_complex else f"call network.to({scene.dtype})")
+            f"train: the scene computes in {dtype_name(scene.dtype)}, but network has parameters in "
+            f"{', '.join(sorted(map(dtype_name, other)))}; "
+            + (
+                f"make its complex ones {dtype_name(wanted[True])}"
+                if has_complex
+                else f"call network.to({scene.dtype})"
+            )
         )
     try:
         with evaluating(network), torch.random.fork_rng(devices=[]):

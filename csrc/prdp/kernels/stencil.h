@@ -35,9 +35,8 @@ class Stencil final : public Kernel<T> {
   bool is_surely_definite() const override { return !this->null_space() && coefficients_.is_surely_definite(); }
   bool has_definite_factors(const T* x, const T* b) const override {
     if (!is_surely_definite() || coefficients_.spread() >= kWidestRowsOfFactors) return false;
-    const int64_t plane = layout().rows * layout().row;
-    for (int64_t channel = 0; channel < channels(); ++channel)
-      if (!coefficients_.sums_agree(x + channel * plane, b + channel * plane)) return false;
+    for (int64_t at = 0; at < this->length(); at += layout().plane)
+      if (!coefficients_.sums_agree(x + at, b + at)) return false;
     return true;
   }
 

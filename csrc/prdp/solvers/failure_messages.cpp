@@ -61,7 +61,7 @@ std::string badly_scaled(const Solver& solver, const Operator& a, const at::Tens
     if (!(spread > 1.0 / (64.0 * epsilon_of(b)))) continue;
     const bool direct = traits(solver.method).is_direct, single = b.scalar_type() == at::kFloat;
     return std::string(direct ? "A is singular, or has " : "A has ") + "badly scaled " +
-           (columns ? "columns" : "rows") + ": the largest is " + number(spread) +
+           (columns ? "columns" : "rows") + ": the largest is " + three_digits(spread) +
            " times the smallest, which is lost beside it; scale A and b" +
            (single   ? ", or take float64"
             : direct ? ""
@@ -130,8 +130,8 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
   if (!known && !is_finite(a, b, sample))
     return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
   return "a number left the range of " + std::string(single ? "float32" : "float64") + " (" +
-         (known ? "‖A‖ is " + number(norm) + ", " : "") + "‖b‖ is " +
-         (std::isinf(norm_b) ? "above 1.8e+308" : number(norm_b)) + "); " +
+         (known ? "‖A‖ is " + three_digits(norm) + ", " : "") + "‖b‖ is " +
+         (std::isinf(norm_b) ? "above 1.8e+308" : three_digits(norm_b)) + "); " +
          (single ? "take float64, or scale A and b" : "scale A and b");
 }
 
@@ -155,7 +155,7 @@ std::string breakdown(const SolveRole& role, const Operator& a, const at::Tensor
          "take a b without that part, or add a multiple of the identity to A";
 }
 
-/// Why the factors of a diffusion lose what `Direct` needs of it, see kernels::kWidestRowsOfFactors. Else empty.
+/// Why the factors of a diffusion lose what `Direct` needs of it (Kernel::has_definite_factors), in words. Else empty.
 std::string lost_in_factors(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (!traits(role.solver.method).is_direct || !role.a.kind.starts_with("diffusion")) return {};
   const auto of = [&](const at::Tensor& t) { return t.expand_as(b).select(0, sample).to(at::kDouble).abs(); };
@@ -232,7 +232,7 @@ std::string inconsistent(const SolveRole& role, const Operator& a, const at::Ten
            (role.adjoint ? "Aᵀ" : "A") + " cannot reach, as " + (role.adjoint ? "A" : "Aᵀ") +
            " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") + name_the_null_space();
   const auto outside = (b - a.project(b)).select(0, sample);
-  const auto share = number(100.0 * norm_of(outside) / norm_of(b.select(0, sample))) + " % of ";
+  const auto share = three_digits(100.0 * norm_of(outside) / norm_of(b.select(0, sample))) + " % of ";
   if (!operator_kind(role.a.kind).has_pressure) {
     const auto fields = outside.dim() > 1 ? outside.flatten(1) : outside.unsqueeze(0);
     const bool is_constant =

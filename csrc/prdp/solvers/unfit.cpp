@@ -4,10 +4,9 @@
 
 #include <algorithm>
 #include <cmath>
-#include <iomanip>
 #include <limits>
-#include <sstream>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/probes.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
@@ -52,16 +51,10 @@ bool needs_symmetry(Method method) {
 
 }  // namespace
 
-std::string number(double x) {
-  std::ostringstream text;
-  text << std::setprecision(3) << x;
-  return text.str();
-}
-
 std::string asymmetric(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const double share = asymmetry(a, b, sample);
   if (!(share > (is_function(role.a) ? rounding_of_differences(b) : 100.0 * epsilon_of(b)))) return {};
-  return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
+  return "A is not symmetric (‖A v - Aᵀ v‖ is " + three_digits(share) + " ‖A v‖ for a v of no structure); take GMRES";
 }
 
 std::string unfit(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
@@ -77,7 +70,7 @@ std::string unfit(const SolveRole& role, const Operator& a, const at::Tensor& b,
            "activations";
   const double share = symmetric ? asymmetry(*m, b, sample) : 0.0;
   if (!(share > rounding_of_differences(b))) return {};
-  return "its preconditioner is not symmetric (‖M⁻¹v - M⁻ᵀv‖ is " + number(share) +
+  return "its preconditioner is not symmetric (‖M⁻¹v - M⁻ᵀv‖ is " + three_digits(share) +
          " ‖M⁻¹v‖ for a v of no structure); take GMRES";
 }
 

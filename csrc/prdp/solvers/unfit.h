@@ -13,7 +13,4 @@ std::string asymmetric(const SolveRole& role, const Operator& a, const at::Tenso
 /// not: that, in words. Else empty.
 std::string unfit(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample);
 
-/// "1.23"
-std::string number(double x);
-
 }  // namespace prdp

@@ -4,20 +4,15 @@
 #include <unistd.h>
 
 #include <algorithm>
-#include <iomanip>
-#include <sstream>
 
+#include "prdp/error_text.h"
 #include "prdp/solvers/methods.h"
 
 namespace prdp {
 
 namespace {
 
-std::string gigabytes(double bytes) {
-  std::ostringstream text;
-  text << std::setprecision(3) << bytes / 1e9 << " GB";
-  return text.str();
-}
+std::string gigabytes(double bytes) { return three_digits(bytes / 1e9) + " GB"; }
 
 }  // namespace
 
