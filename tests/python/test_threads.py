@@ -114,6 +114,30 @@ print(cases, "cases")
 
 
 @pytest.mark.alone
+@pytest.mark.parametrize("n", [127, 300, 515])
+def test_threads_share_a_dense_matrix_and_its_transpose(n):
+    assert "8 cases" in run(f"""
+cases = 0
+for dtype, tolerance in ((torch.float32, 1e-3), (torch.float64, 1e-9)):
+    matrix, b, g = torch.randn({n}, {n}), torch.randn(1, {n}, dtype=dtype), torch.randn(1, {n}, dtype=dtype)
+    matrix = (matrix + 3 * {n}**0.5 * torch.eye({n})).to(dtype)
+    exact = torch.linalg.solve(matrix.double().mT, g.double().mT).mT.to(dtype)
+    iterative = [method(60, rtol=tolerance / 100) for method in (prdp.GMRES, prdp.BiCGStab, prdp.Jacobi)]
+    for solver in (prdp.Direct(), *iterative):
+        results = []
+        for count in (1, 2, 3):
+            leaf = b.clone().requires_grad_()
+            def back():
+                u = prdp.linear_solve(matrix, leaf, solver, on_failure="return")[0]
+                return torch.autograd.grad(u, leaf, g)[0]
+            results.append(with_threads(count, back)[0])
+        torch.testing.assert_close(results[0], exact, rtol=tolerance, atol=tolerance)
+        assert all(torch.equal(other, results[0]) for other in results[1:]), solver
+        cases += 1
+print(cases, "cases")
+""")
+
+
 def test_two_threads_share_a_batch():
     """Minima of interleaved runs of some 0.1 s; half the time on two idle cores."""
     one, two = map(

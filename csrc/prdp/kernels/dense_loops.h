@@ -1,7 +1,7 @@
 #pragma once
 #include "prdp/kernels/vector_loops.h"
 
-/// The part of loops.cpp for products of small dense matrices; included there only.
+/// The part of loops.cpp for products with dense matrices; included there only.
 namespace prdp::kernels {
 
 namespace {
@@ -41,6 +41,23 @@ void multiply(const DenseProduct<T>& p) {
       for (int64_t k = 0; k < p.inner; ++k) sum += p.a[r * p.inner + k] * p.b[k * n + c];
       p.out[r * n + c] = sum;
     }
+}
+
+/// See Loops<T>::add_rows, for the first Rows of them.
+template <int Rows, class T>
+void add_block_of_rows(const T* weights, const T* rows, int64_t stride, T* __restrict out, int64_t n) {
+  for (int64_t j = 0; j < n; ++j) {
+    T sum = out[j];
+    for (int r = 0; r < Rows; ++r) sum += weights[r] * rows[r * stride + j];
+    out[j] = sum;
+  }
+}
+
+template <class T>
+void add_rows(const T* weights, const T* rows, int64_t stride, int64_t count, T* out, int64_t n) {
+  for_each_block<8>(0, count, [&](int64_t i, auto size) {
+    add_block_of_rows<size.value>(weights + i, rows + i * stride, stride, out, n);
+  });
 }
 
 }  // namespace

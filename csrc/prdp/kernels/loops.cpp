@@ -54,6 +54,7 @@ constexpr Loops<T> table(const char* level) {
           add_merged<T>,
           galerkin_product<T>,
           multiply<T>,
+          add_rows<T>,
           factor_lu,
           advect_row<T>,
           advect_row_back<T>};

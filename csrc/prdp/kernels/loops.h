@@ -180,6 +180,8 @@ struct Loops {
   void (*galerkin_product)(const GalerkinProduct<T>& c, int64_t step, int64_t n);
 
   void (*multiply)(const DenseProduct<T>& p);
+  /// out += Σ weights_i row_i, in their order, for `count` rows of n that lie `stride` apart; any n.
+  void (*add_rows)(const T* weights, const T* rows, int64_t stride, int64_t count, T* out, int64_t n);
   /// P A = L U with partial pivoting, in the place of A, whose n columns begin `stride` apart. L has ones on its
   /// diagonal. Row i of P A is row rows[i] of A.
   void (*factor_lu)(double* a, int64_t stride, int64_t n, int64_t* rows);

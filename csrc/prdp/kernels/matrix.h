@@ -36,10 +36,10 @@ class MatrixKernel : public Kernel<T> {
     return memory_.data();
   }
 
-  /// Calls body(begin, end) for parts of the rows, which several threads may share; `work` is that of all.
+  /// Calls body(begin, end) for parts of at least so many rows, which several threads may share; `work` is that of all.
   template <class Body>
-  void for_each_part(int64_t work, const Body& body) const {
-    const int64_t each = std::max<int64_t>(kBlock * n() / std::max<int64_t>(work, 1), 1);
+  void for_each_part(int64_t work, int64_t least, const Body& body) const {
+    const int64_t each = std::max<int64_t>(kBlock * n() / std::max<int64_t>(work, 1), least);
     share_rows::for_each((n() + each - 1) / each, [&](int64_t p) { body(p * each, std::min(n(), (p + 1) * each)); });
   }
 
@@ -76,13 +76,15 @@ class Dense final : public MatrixKernel<T> {
   const T* values() const { return a_; }
   bool transposed() const { return transposed_; }
   void apply(const T* v, T* out) const override {
-    this->for_each_part(work(), [&](int64_t begin, int64_t end) {
-      if (!transposed_) {
+    if (!transposed_) {
+      return this->for_each_part(work(), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) out[i] = loops_.dot(a_ + i * n(), v, n());
-        return;
-      }
+      });
+    }
+    constexpr int64_t least = 128;  // columns, so that pieces of rows fill whole cache lines
+    this->for_each_part(work(), least, [&](int64_t begin, int64_t end) {
       std::fill(out + begin, out + end, T(0));
-      for (int64_t i = 0; i < n(); ++i) loops_.axpy(v[i], a_ + i * n() + begin, out + begin, end - begin);
+      loops_.add_rows(v, a_ + begin, n(), n(), out + begin, end - begin);
     });
   }
   double norm() const override {
@@ -124,7 +126,7 @@ class Csr final : public MatrixKernel<T> {
   int64_t stored() const { return crow_[n()]; }
   int64_t work() const override { return stored() + n(); }
   void apply(const T* v, T* out) const override {
-    this->for_each_part(work(), [&](int64_t begin, int64_t end) {
+    this->for_each_part(work(), 1, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) {
         T sum = 0;
         for (int64_t k = crow_[i]; k < crow_[i + 1]; ++k) sum += values_[k] * v[col_[k]];
