@@ -299,3 +299,24 @@ def test_the_first_state_keeps_its_gradient_where_steps_have_none(flow):
 def test_bad_arguments_are_refused_in_words(call, error, message):
     with pytest.raises(error, match=message):
         call(prdp.Heat((9,), 1e-3, 1.0, solver=prdp.Jacobi(3)), field((9,)))
+
+
+def test_a_rollout_holds_its_states_once():
+    """By the bytes that torch allocates: the states, beside at most three fields of the step at work."""
+    state, steps = torch.randn(1, 1, 64, 64), 20
+    heat = prdp.Heat((64, 64), 1e-3, 1.0, solver=prdp.CG(4))
+    heat.rollout(state, 1)
+
+    def peak(call):
+        with torch.profiler.profile(profile_memory=True) as profile:
+            call()
+        held = most = 0
+        for event in profile.profiler.kineto_results.events():
+            if event.name() == "[memory]":
+                held += event.nbytes()
+                most = max(most, held)
+        return most / (state.numel() * 4)
+
+    assert steps + 1 <= peak(lambda: heat.rollout(state, steps)) < steps + 4
+    u = heat.rollout(state.requires_grad_(), steps)
+    assert peak(lambda: u.backward(torch.ones(()).expand(u.shape))) < 5

@@ -10,7 +10,6 @@
 #include "prdp/steppers/rollout.h"
 #include "prdp/steppers/rollout_node.h"
 #include "prdp/steppers/stepper.h"
-#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -51,10 +50,9 @@ void check_rollout(const Equation& equation, const at::Tensor& u, const c10::Sym
 SolveOutputs solve_all(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
                        const SolveOptions& options) {
   check_rollout(equation, u, solves, options);
-  const int64_t picard = equation.picard_steps, unknowns = u.numel();
+  const int64_t picard = equation.picard_steps;
   at::Tensor b;
-  return outputs_of(solve_by_solve(u, solves.expect_int(), picard, [&](const at::Tensor& last, int64_t s) {
-    interruption::Watch::local().spend(unknowns);
+  return outputs_of(solve_in_place(u, solves.expect_int(), picard, [&](const at::Tensor& last, int64_t s) {
     if (s % picard == 0) b = equation_rhs(equation, last);
     return linear_solve_unrecorded(equation_operator(equation, last), b, options, start_of_step(options, last));
   }));

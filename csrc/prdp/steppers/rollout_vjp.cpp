@@ -2,6 +2,8 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include <utility>
+
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
@@ -66,7 +68,7 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
     std::vector<int64_t> wanted(needed.begin(), needed.end());
     wanted[0] = needed[0] || first > 0;
     if (kind.linearised) wanted.insert(wanted.begin() + 1, needed[0] || s > 0);
-    const auto [gradients, info] = solve_vjp(bars[s + 1], solved, a, each, wanted, adjoint_solve);
+    const auto [gradients, info] = solve_vjp(std::exchange(bars[s + 1], {}), solved, a, each, wanted, adjoint_solve);
     add_to(rhs_is_state ? bars[first] : rhs_bar, gradients[0]);
     if (kind.linearised) add_to(bars[s], gradients[1]);
     if (s == first && rhs_bar.defined()) {

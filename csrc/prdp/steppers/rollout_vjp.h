@@ -32,6 +32,27 @@ SolveResult solve_by_solve(const at::Tensor& u, int64_t solves, int64_t of_step,
   return {at::stack(solutions, 1), side_by_side(std::move(infos), u)};
 }
 
+/// The same where autograd does not look on: each solution goes into its place at once, and is held a second time only
+/// until the next one is there.
+template <class Next>
+SolveResult solve_in_place(const at::Tensor& u, int64_t solves, int64_t of_step, const Next& next) {
+  auto sizes = u.sizes().vec();
+  sizes.insert(sizes.begin() + 1, solves + 1);
+  const auto solutions = at::empty(sizes, u.options());
+  solutions.select(1, 0).copy_(u);
+  std::vector<SolveInfo> infos;
+  auto last = u;
+  for (int64_t s = 0; s < solves; ++s) {
+    const FailuresOfStep here(s / of_step + 1, solves / of_step);
+    interruption::Watch::local().spend(u.numel());
+    auto [solution, info] = next(last, s);
+    last = std::move(solution);
+    solutions.select(1, s + 1).copy_(last);
+    infos.push_back(std::move(info));
+  }
+  return {solutions, side_by_side(std::move(infos), u)};
+}
+
 /// The reverse, from the cotangent (batch, solves + 1, …) of the solutions: `back(s)` takes the cotangent of solution
 /// s + 1 through solve s and returns the report of its adjoint solve, if there is one. The log gets all of them.
 template <class Back>
