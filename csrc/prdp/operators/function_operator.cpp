@@ -3,6 +3,8 @@
 #include <ATen/ExpandUtils.h>
 #include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/functorch/DynamicLayer.h>
+#include <c10/core/AutogradState.h>
+#include <c10/core/InferenceMode.h>
 #include <torch/csrc/autograd/autograd.h>
 
 #include <algorithm>
@@ -30,18 +32,42 @@ at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* na
   return result;
 }
 
-/// Counts writes into tensors also below autograd, where a solve runs. What a product changes beside that, such as a
-/// mode that it enters, stays.
-class WritesCounted {
+/// Inside an operation of torch, where a solve runs, torch as somebody's product knows it outside: nothing is recorded,
+/// but what the product itself differentiates or maps is, and writes into tensors are counted. What it changes beside
+/// that, such as a mode that it enters, stays.
+class AsOutside {
  public:
-  WritesCounted() { c10::impl::tls_set_dispatch_key_excluded(kCounter, false); }
-  ~WritesCounted() { c10::impl::tls_set_dispatch_key_excluded(kCounter, was_excluded_); }
-  WritesCounted(const WritesCounted&) = delete;
-  WritesCounted& operator=(const WritesCounted&) = delete;
+  AsOutside() {
+    auto keys = c10::impl::tls_local_dispatch_key_set();
+    keys.excluded_ = keys.excluded_ - lifted_;
+    c10::impl::_force_tls_local_dispatch_key_set(keys);
+    if (is_below_autograd()) set_modes(/*reverse=*/false, /*forward=*/true);
+  }
+  ~AsOutside() {
+    auto keys = c10::impl::tls_local_dispatch_key_set();
+    keys.excluded_ = keys.excluded_ | lifted_;
+    c10::impl::_force_tls_local_dispatch_key_set(keys);
+    if (is_below_autograd()) set_modes(was_recording_, had_forward_mode_);
+  }
+  AsOutside(const AsOutside&) = delete;
+  AsOutside& operator=(const AsOutside&) = delete;
 
  private:
-  static constexpr auto kCounter = c10::DispatchKey::ADInplaceOrView;
-  const bool was_excluded_ = c10::impl::tls_is_dispatch_key_excluded(kCounter);
+  bool is_below_autograd() const { return lifted_.has(c10::DispatchKey::AutogradFunctionality); }
+  static void set_modes(bool reverse, bool forward) {
+    c10::AutogradState::get_tls_state().set_grad_mode(reverse);
+    c10::AutogradState::get_tls_state().set_fw_grad_mode(forward);
+  }
+  /// What is excluded now, but for what a user may have switched off.
+  static c10::DispatchKeySet excluded_by_operations() {
+    auto keys = c10::impl::tls_local_dispatch_key_set().excluded_ - c10::default_excluded_set -
+                c10::DispatchKeySet({c10::DispatchKey::Python, c10::DispatchKey::PythonTLSSnapshot});
+    return c10::InferenceMode::is_enabled() ? keys - c10::autograd_dispatch_keyset : keys;
+  }
+
+  const c10::DispatchKeySet lifted_ = excluded_by_operations();
+  const bool was_recording_ = c10::AutogradState::get_tls_state().get_grad_mode();
+  const bool had_forward_mode_ = c10::AutogradState::get_tls_state().get_fw_grad_mode();
 };
 
 /// How often a tensor was written to; unknown in inference mode.
@@ -107,7 +133,7 @@ at::Tensor FunctionOperator::product(const Products::Product& function, const at
   const auto copy = is_first ? v.clone() : at::Tensor();
   const auto call = [&] {
     if (in_torch_func()) return function(v, tensors);
-    const WritesCounted counted;
+    const AsOutside as_outside;
     return function(v, tensors);
   };
   const auto result = checked(call(), v, name);
