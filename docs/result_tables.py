@@ -92,7 +92,7 @@ def _name(row, seeds):
 
 PARTS = ("prdp_defaults", "prdp_growth", "tolerance", "tolerance_adjoint", "rtol_0.0001")
 # Constant K that the text of a page does not speak of. The appendix has them.
-CONSTANT = {"heat_2d": (2, 20), "burgers_1d": (4, 12, 16), "poisson_1p_implicit": (100, 200, 300, 400)}
+CONSTANT = {"heat_2d": (2, 20)}
 
 
 def main_rows(name, with_seconds=True):
