@@ -70,7 +70,6 @@ DIFFUSION = [
     ("`Direct` (sparse Cholesky)", "direct"),
     ("CG on `Function`", "CG, Function"),
     ("torch eager, CG", "torch eager, CG"),
-    ("torch eager with a CSR matrix, CG", "torch eager CSR, CG"),
     ("torch.compile, CG", "torch.compile, CG"),
     ("JAX jit, CG", "JAX jit, CG"),
     ("lineax, CG", "lineax, CG"),
