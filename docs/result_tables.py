@@ -91,14 +91,18 @@ def _name(row, seeds):
 
 
 PARTS = ("prdp_defaults", "prdp_growth", "tolerance", "tolerance_adjoint", "rtol_0.0001")
-# Constant K that the text of a page does not speak of. The appendix has them.
-CONSTANT = {"heat_2d": (2, 20)}
+# Rows that the text of a page does not speak of. The appendix has them.
+IN_APPENDIX = {
+    "heat_2d": ("constant_2", "constant_20"),
+    "refinement_navier_stokes": ("rtol_0.1",),
+    "refinement_diffusion_inverse": ("rtol_0.1",),
+}
 
 
 def main_rows(name, with_seconds=True):
     """A comparison without the parts of a rule, and without the products of each kind."""
     body, found = [], record(name)
-    left_out = (*PARTS, *(f"constant_{k}" for k in CONSTANT.get(name, ())))
+    left_out = PARTS + IN_APPENDIX.get(name, ())
     for row in found["rows"]:
         if row["label"] not in left_out:
             time = [seconds_beside(row, found)] if with_seconds else []
