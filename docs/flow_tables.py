@@ -32,7 +32,7 @@ def short():
     """Seconds of a rollout with its gradient; in brackets, without."""
 
     def cell(result):
-        forward, both = (tables.seconds(result[f"{part}_seconds"]) for part in ("forward", "gradient"))
+        forward, both = (tables.seconds(result[f"{part}_seconds"])[:-2] for part in ("forward", "gradient"))
         return f"{both} ({forward})"
 
     return tables.grid(rows_of("cost"), SHORT, cell, {name: solvers.FLOWS[name] for name in SHOWN})

@@ -15,14 +15,16 @@ TABLE = page_tables.places("scene_keys.py")
 
 def table(name):
     """Return the Markdown table of the keys in one table of a scene file; "the top level" has a name too."""
-    rows = ["| key | value | default | meaning |", "|---|---|---|---|"]
+    rows = ["| key | value | meaning |", "|---|---|---|"]
     for key in _C.scene_keys():
         if (key["table"] or "the top level") == name:
             meaning = key["means"].replace("](#", "](command_line.md#")
             meaning += f" ({key['when']})" if key["when"] else ""
             value = re.sub("(>=?) ", r"\1&nbsp;", key["value"].replace("whole number", "integer"))
             value += f" ({key['unit']})" if key["unit"] else ""
-            cells = f"`{key['name']}`", value, key["default"] or "", meaning
+            if key["default"]:
+                value += "; optional" if key["default"] == "none" else f"; default {key['default']}"
+            cells = f"`{key['name']}`", value, meaning
             rows.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
     return "\n".join(rows) + "\n"
 
