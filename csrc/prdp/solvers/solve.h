@@ -2,7 +2,7 @@
 #include <functional>
 
 #include "prdp/operators/operator.h"
-#include "prdp/solvers/sample_state.h"
+#include "prdp/solvers/batch_arrays.h"
 #include "prdp/solvers/solver.h"
 
 namespace prdp {
@@ -38,6 +38,26 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
 
 /// The report of what came of these samples, with numbers of this dtype.
 SolveInfo info_of(const std::vector<SampleOutcome>& outcomes, at::ScalarType real);
+
+/// The arrays of a request for b and its result. The tensors are contiguous, and on one device; `caps` and `x0`, as in
+/// the request, may be undefined.
+template <class T>
+BatchArrays<T> arrays_of(const SolveRequest& request, const at::Tensor& b, const at::Tensor& x0, const at::Tensor& caps,
+                         const SolveResult& result) {
+  const auto& [u, info] = result;
+  return {.b = b.const_data_ptr<T>(),
+          .x0 = x0.defined() ? x0.const_data_ptr<T>() : nullptr,
+          .u = u.mutable_data_ptr<T>(),
+          .caps = caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
+          .report = {.iterations = info.iterations.mutable_data_ptr<int64_t>(),
+                     .status = info.status.mutable_data_ptr<int64_t>(),
+                     .applications = info.operator_applications.mutable_data_ptr<int64_t>(),
+                     .residual = info.residual.mutable_data_ptr<T>(),
+                     .floor = info.floor.mutable_data_ptr<T>()},
+          .max_iter = request.solver.max_iter.expect_int(),
+          .rtol = request.solver.rtol,
+          .guarded = request.guarded};
+}
 
 /// How the last solve of this thread was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors";
 /// "" before the first.
