@@ -6,6 +6,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/detach_failed.h"
+#include "prdp/autograd/for_each_cotangent.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/registered_products.h"
