@@ -3,7 +3,8 @@
 #include "bindings.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/steppers/flow/flow.h"
-#include "prdp/steppers/flow/step_node.h"
+#include "prdp/steppers/flow/rollout.h"
+#include "solves.h"
 
 namespace py = pybind11;
 using namespace prdp;
@@ -34,12 +35,6 @@ FlowEquation make_equation(std::shared_ptr<const FlowBox> box, double dt, at::Te
           flow_pressure_from_name(pressure)};
 }
 
-SolveOptions with(SolveOptions options, int64_t max_iter, int64_t adjoint_log) {
-  options.solver.max_iter = max_iter;
-  options.adjoint_log = adjoint_log;
-  return options;
-}
-
 /// The result of a call, with the errors that torch would raise.
 template <class Call>
 auto without_lock(const Call& call) {
@@ -52,8 +47,7 @@ auto without_lock(const Call& call) {
 
 template <class Solve>
 py::tuple report(const Solve& solve) {
-  const auto [u, info] = without_lock(solve);
-  return py::make_tuple(u, info.iterations, info.residual, info.status, info.operator_applications, info.floor);
+  return as_tuple(without_lock(solve));
 }
 
 }  // namespace

@@ -10,17 +10,15 @@
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/sum_over_axes.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/solvers/warnings.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
+#include "solves.h"
 
 namespace py = pybind11;
 using namespace prdp;
 
 namespace {
-
-py::tuple as_tuple(const SolveInfo& info) {
-  return py::make_tuple(info.iterations, info.residual, info.status, info.operator_applications, info.floor);
-}
 
 OperatorSpec spec(std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
                   std::vector<at::Tensor> tensors) {

@@ -8,6 +8,7 @@
 #include "prdp/operators/registered_products.h"
 #include "prdp/steppers/equation.h"
 #include "prdp/steppers/memory_check.h"
+#include "solves.h"
 
 /// The ops step and linear_solve past torch's dispatcher, which costs more than a small solve. None where somebody
 /// watches; then the op is to be called.
@@ -37,19 +38,12 @@ SolveOptions unpack_lists(const std::vector<std::string>& names, const std::vect
                 preconditioner);
 }
 
-SolveOptions with(SolveOptions options, int64_t max_iter, int64_t adjoint_log) {
-  options.solver.max_iter = max_iter;
-  options.adjoint_log = adjoint_log;
-  return options;
-}
-
 template <class Solve>
-py::object report(const Solve& solve) {
-  const auto [u, info] = [&] {
+py::tuple without_lock(const Solve& solve) {
+  return as_tuple([&] {
     const py::gil_scoped_release no_gil;
     return solve();
-  }();
-  return py::make_tuple(u, info.iterations, info.residual, info.status, info.operator_applications, info.floor);
+  }());
 }
 
 py::object call_step(const py::object& u, const std::vector<py::object>& tensors, const Equation& equation,
@@ -58,7 +52,7 @@ py::object call_step(const py::object& u, const std::vector<py::object>& tensors
   if (!nobody_in_python_watches(u, tensors)) return py::none();
   auto whole = equation;
   whole.tensors = unwrapped(tensors);
-  return report([&, state = THPVariable_Unpack(u.ptr())] {
+  return without_lock([&, state = THPVariable_Unpack(u.ptr())] {
     RECORD_FUNCTION("prdp::step", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
     return step(whole, state, with(options, max_iter, adjoint_log));
   });
@@ -74,7 +68,7 @@ py::object call_linear_solve(const py::object& b, const std::vector<py::object>&
   const auto rhs = THPVariable_Unpack(b.ptr());
   if (is_watched && is_function(a) && in_vmap()) refuse_mapped_captures(a, rhs);  // as linear_solve() does
   if (is_watched) return py::none();
-  return report([&, start = x0 ? THPVariable_Unpack(x0->ptr()) : at::Tensor()] {
+  return without_lock([&, start = x0 ? THPVariable_Unpack(x0->ptr()) : at::Tensor()] {
     check_memory(options, rhs);
     return linear_solve(a, rhs, with(options, max_iter, adjoint_log), start);
   });

@@ -10,6 +10,7 @@
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/stencil_operator.h"
+#include "prdp/solvers/warnings.h"
 #include "prdp/steppers/flow/flow.h"
 #include "prdp/steppers/implicit_step.h"
 #include "prdp/steppers/steppers.h"

@@ -149,7 +149,7 @@ def test_the_cpp_blocks_use_public_names(block):
     for header in re.findall(r"#include <(prdp\w*/[^>]+)>", block.code):
         assert f"csrc/{header}" in headers
     for name in re.findall(r"prdp::(\w+)", block.code):
-        assert re.search(rf"\b(class|struct|namespace) {name}\b|\b{name}\(|TORCH_MODULE\({name}\)", public), name
+        assert re.search(rf"\b(class|struct|namespace|using) {name}\b|\b{name}\(|TORCH_MODULE\({name}\)", public), name
 
 
 def test_every_guarantee_names_tests_that_exist():

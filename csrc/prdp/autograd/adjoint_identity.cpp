@@ -4,7 +4,7 @@
 
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/raise_or_warn.h"
+#include "prdp/solvers/report_failures.h"
 
 namespace prdp {
 

@@ -4,6 +4,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/linear_solve.h"
+#include "prdp/autograd/op_results.h"
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"
@@ -12,6 +13,7 @@
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/report_failures.h"
 #include "prdp/solvers/solve_on_gpu.h"
 
 namespace prdp {

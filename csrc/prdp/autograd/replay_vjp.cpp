@@ -3,7 +3,7 @@
 #include "prdp/autograd/stored_iterates.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/solve.h"
+#include "prdp/solvers/solve_recorded.h"
 
 namespace prdp {
 
@@ -35,12 +35,13 @@ class Replay {
   void load(int64_t slot, int64_t k) { now_ = kept_[slot], done_ = k; }
   void step() { now_ = solve_.step(*make_(tensors()), inputs_[0], now_, done_++); }
 
+  /// Records iteration k alone, from leaves: the state before it, and the inputs.
   void step_back(int64_t slot, int64_t k) {
     std::vector<at::Tensor> leaves, inputs = inputs_;
     State before = kept_[slot];
     for (auto& part : before) leaves.push_back(part = part.detach().requires_grad_());
     for (size_t i = 0; i < inputs.size(); ++i)
-      if (needed_[i] || i == 0) leaves.push_back(inputs[i] = inputs[i].detach().requires_grad_());
+      if (is_differentiated(i)) leaves.push_back(inputs[i] = inputs[i].detach().requires_grad_());
     std::vector<at::Tensor> outputs, cotangents;
     const auto found = with_autograd([&] {
       const auto a = make_({inputs.begin() + 1, inputs.end()});
@@ -55,7 +56,7 @@ class Replay {
     });
     bars_.assign(found.begin(), found.begin() + before.size());
     for (size_t i = 0, next = before.size(); i < inputs.size(); ++i)
-      if (needed_[i] || i == 0) add_to(gradients[i], found[next++]);
+      if (is_differentiated(i)) add_to(gradients[i], found[next++]);
   }
 
   /// From the cotangent of the right-hand side, b - A start, to those of b and A.
@@ -78,6 +79,8 @@ class Replay {
   std::vector<at::Tensor> gradients;  // of the right-hand side and the tensors of A
 
  private:
+  /// The right-hand side always: finish() takes its cotangent to those of A.
+  bool is_differentiated(size_t input) const { return needed_[input] || input == 0; }
   std::vector<at::Tensor> tensors() const { return {inputs_.begin() + 1, inputs_.end()}; }
 
   MakeOperator make_;

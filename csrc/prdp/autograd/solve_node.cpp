@@ -1,5 +1,6 @@
 #include "prdp/autograd/solve_node.h"
 
+#include "prdp/autograd/for_each_cotangent.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"

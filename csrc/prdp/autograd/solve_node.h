@@ -5,7 +5,7 @@
 #include "prdp/autograd/node_pointer.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/registered_products.h"
-#include "prdp/solvers/solve.h"
+#include "prdp/solvers/warnings.h"
 
 namespace prdp {
 

@@ -11,6 +11,7 @@
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/report_failures.h"
 #include "prdp/solvers/solve_on_gpu.h"
 
 namespace prdp {
@@ -35,6 +36,16 @@ at::Tensor without_failed(const at::Tensor& derivative, const at::Tensor& status
 }
 
 namespace {
+
+/// Those of the adjoint solve, by its own limits where it has some.
+SolveOptions options_of_adjoint(SolveOptions o) {
+  o.solver.max_iter = o.adjoint_max_iter.value_or(o.solver.max_iter);
+  o.solver.rtol = o.adjoint_rtol.value_or(o.solver.rtol);
+  // Without a tolerance of its own, the adjoint solve keeps the traced one of the solve.
+  if (o.adjoint_rtol || o.traced_adjoint_rtol.is_symbolic()) o.traced_rtol = o.traced_adjoint_rtol;
+  o.solver.preconditioner = o.solver.preconditioner.transposed();
+  return o;
+}
 
 /// Samples whose share of ḡ may leave the range of the dtype, told by the largest numbers of λ and u.
 at::Tensor may_overflow(const at::Tensor& lambda, const at::Tensor& u) {
@@ -70,12 +81,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
                       const SolveOptions& options, at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
   auto transpose = a;
   transpose.transposed = !a.transposed;
-  auto o = options;
-  o.solver.max_iter = o.adjoint_max_iter.value_or(o.solver.max_iter);
-  o.solver.rtol = o.adjoint_rtol.value_or(o.solver.rtol);
-  // Without a tolerance of its own, the adjoint solve keeps the traced one of the solve.
-  if (o.adjoint_rtol || o.traced_adjoint_rtol.is_symbolic()) o.traced_rtol = o.traced_adjoint_rtol;
-  o.solver.preconditioner = o.solver.preconditioner.transposed();
+  const auto o = options_of_adjoint(options);
   auto [lambda, info] = adjoint_solve(transpose, cotangent, o, /*x0=*/{});
   if (o.on_failure == OnFailure::kZeroGrad) lambda = without_failed(lambda, info.status, o.on_failure);
 

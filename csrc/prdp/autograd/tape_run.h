@@ -64,10 +64,10 @@ class TapeRun {
   void start() {
     space_.record(true);
     method_.start();
-    each([&](auto& part, size_t i) { put(part, begin_, i); });
+    each([&](auto& part, size_t i) { remember(part, begin_, i); });
     tape_.keep();
     space_.record(false);
-    each([&](auto& part, size_t) { forget(part); });
+    each([&](auto& part, size_t) { make_constant(part); });
     done_ = 0;
   }
   void step() {
@@ -94,17 +94,19 @@ class TapeRun {
   void step_back(int64_t, int64_t k) {
     tape_.release();
     space_.record(true);
+    // What the state at hand was made of: by the start, or as new inputs of this iteration alone.
     Parts before = begin_;
     if (k > 0) {
       each([&](auto& part, size_t i) {
         if constexpr (is_number<decltype(part)>) space_.set(part, part.value);
-        put(part, before, i);
+        remember(part, before, i);
       });
     } else {
-      each([&](auto& part, size_t i) { pull(part, before, i); });
+      each([&](auto& part, size_t i) { recall(part, before, i); });
     }
     method_.resume(k);
     iterate_once();
+    // The cotangents of the state after it, and then back to those of the state before it.
     each([&](auto& part, size_t i) {
       if constexpr (!is_number<decltype(part)>) {
         if (bars_[i].holds) tape_.give_bar(part.version, bars_[i].vector);
@@ -140,12 +142,13 @@ class TapeRun {
     std::array<Vector, kVectors + kNumbers> vectors;
     std::array<Number, kVectors + kNumbers> numbers;
   };
-  static void put(const Vector& part, Parts& parts, size_t i) { parts.vectors[i] = part; }
-  static void put(const Number& part, Parts& parts, size_t i) { parts.numbers[i] = part; }
-  static void pull(Vector& part, const Parts& parts, size_t i) { part.version = parts.vectors[i].version; }
-  static void pull(Number& part, const Parts& parts, size_t i) { part = parts.numbers[i]; }
-  static void forget(Vector&) {}
-  static void forget(Number& part) { part = part.value; }
+  /// Notes a part of a state; takes it back from there; and makes it a constant.
+  static void remember(const Vector& part, Parts& parts, size_t i) { parts.vectors[i] = part; }
+  static void remember(const Number& part, Parts& parts, size_t i) { parts.numbers[i] = part; }
+  static void recall(Vector& part, const Parts& parts, size_t i) { part.version = parts.vectors[i].version; }
+  static void recall(Number& part, const Parts& parts, size_t i) { part = parts.numbers[i]; }
+  static void make_constant(Vector&) {}
+  static void make_constant(Number& part) { part = part.value; }
 
   bool reads(const Vector& part) const { return &part != &method_.x || carries_x_ || stop_.rtol > 0.0; }
   /// Of x and what the method carries, each once.

@@ -12,7 +12,7 @@ namespace {
 
 /// What the samples of this thread use one after the other.
 template <class T>
-struct Memory {
+struct ThreadMemory {
   kernels::Workspace<T>& workspace;
   Tape<T> tape;
   KeptStates<T> kept;
@@ -20,14 +20,14 @@ struct Memory {
 
 /// A and Aᵀ of a sample.
 template <class T>
-struct Pair {
+struct SystemWithTranspose {
   SampleSystem<T> system;
   const kernels::Kernel<T>* transpose;
 };
 
 /// Runs the iterations of a sample in `space` and takes them back, from x̄ in memory of the tape; returns where b̄ is.
 template <class T>
-T* run_and_take_back(Memory<T>& memory, TapeSpace<T>& space, TapeBack<T>& back, T* x_bar, const Solver& solver,
+T* run_and_take_back(ThreadMemory<T>& memory, TapeSpace<T>& space, TapeBack<T>& back, T* x_bar, const Solver& solver,
                      const StoredIterates& plan, double b2) {
   return with_row(solver.method, [&](auto at) -> T* {
     if constexpr (!at.row.has_tape) {
@@ -43,7 +43,8 @@ T* run_and_take_back(Memory<T>& memory, TapeSpace<T>& space, TapeBack<T>& back, 
 }
 
 template <class T>
-void reverse_sample(const Pair<T>& pair, Memory<T>& memory, const ReverseBatch<T>& batch, int64_t s) {
+void reverse_sample(const SystemWithTranspose<T>& pair, ThreadMemory<T>& memory, const ReverseBatch<T>& batch,
+                    int64_t s) {
   const auto& a = pair.system.a();
   const auto& layout = a.layout();
   auto& tape = memory.tape;
@@ -90,8 +91,8 @@ template <class T>
 void reverse_samples(const kernels::KernelBatch<T>& a, const kernels::KernelBatch<T>& transpose,
                      const ReverseBatch<T>& batch, int64_t unknowns, int64_t begin, int64_t end) {
   std::unique_ptr<kernels::Kernel<T>> own, own_transpose;
-  std::optional<Memory<T>> memory;
-  Pair<T> pair;
+  std::optional<ThreadMemory<T>> memory;
+  SystemWithTranspose<T> pair;
   for (int64_t s = begin; s < end; ++s) {
     if (batch.iterations[s] > 0 && (!own || !a.is_shared)) {
       own = a.make(s);
@@ -106,7 +107,7 @@ void reverse_samples(const kernels::KernelBatch<T>& a, const kernels::KernelBatc
       continue;
     }
     const int64_t length = own->length(), halo = own->layout().halo;
-    if (!memory) memory.emplace(Memory<T>{kernels::Workspace<T>::local(), {length, halo}, {length, halo}});
+    if (!memory) memory.emplace(ThreadMemory<T>{kernels::Workspace<T>::local(), {length, halo}, {length, halo}});
     // Nothing may be left of a sample before that was not finite.
     memory->workspace.prepare(SampleSpace<T>::vectors(batch.x0 != nullptr), length, halo);
     reverse_sample(pair, *memory, batch, s);

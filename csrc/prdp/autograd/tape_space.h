@@ -38,7 +38,10 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   }
   void set(Scalar& number, T value) { number = recording_ ? Scalar(value, tape_.numbers) : Scalar(value); }
 
-  // ---- the operations (solvers/space.h)
+  // The operations stand in the groups of solvers/space.h, which says what each does.
+
+  // ---- primitives
+
   Vector vector() {
     const auto home = tape_.add_version();
     return {home, home};
@@ -51,9 +54,6 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   std::vector<X> array(int64_t n) const {
     return std::vector<X>(n);
   }
-  bool started() const { return values_.started(); }
-  int derivatives() const { return recording_ ? 1 : 0; }
-
   void fill_zero(Vector& v) {
     if (recording_) v.version = Tape<T>::kZero;
     else values_.fill_zero(fresh(v));
@@ -62,7 +62,6 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     if (recording_) to.version = from.version;
     else copy_values(value(from), fresh(to));
   }
-  void assign(const Scalar& from, Scalar& to) { to = from; }
   void advance(Vector& x, Vector& next) { std::swap(x, next); }
   void add(const Vector& d, Vector& x) {
     const auto before = x.version;
@@ -78,10 +77,6 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
           .b = before,
           .factor_node = beta.node,
           .factor = beta.value});
-  }
-  Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
-    xpby(x, beta, y);
-    return number(Kind::kSquare, values_.dot(value(y), value(y)), y.version);
   }
   Scalar dot(const Vector& a, const Vector& b) {
     return number(Kind::kDot, values_.dot(value(a), value(b)), a.version, b.version);
@@ -106,25 +101,19 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
           .sign = -1});
     return number(Kind::kSquare, rr, r.version);
   }
-
   void apply(const Vector& v, Vector& out) {
     const T* from = value(v);
     const auto of = v.version;
     values_.apply(from, fresh(out));
     note({.kind = Kind::kApply, .out = out.version, .a = of});
   }
-  std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
-    const T* from = value(v);
-    const auto of = v.version;
-    const auto dots = values_.apply_with_dots(from, fresh(out));
-    note({.kind = Kind::kApply, .out = out.version, .a = of});
-    const auto first = number(Kind::kDot, dots[0], of, out.version);
-    return {first, number(Kind::kSquare, dots[1], out.version)};
+  Scalar residual(const Vector& x, Vector& r) {
+    const T* from = value(x);
+    const auto of = x.version;
+    const T rr = values_.residual(from, fresh(r));
+    note({.kind = Kind::kResidual, .out = r.version, .a = of});
+    return number(Kind::kSquare, rr, r.version);
   }
-  Scalar sum_of_squares(const Scalar& v2, const Scalar& a, const Scalar& w2) const {
-    return values_.sum_of_squares(v2.value, a.value, w2.value);
-  }
-  void keep_in_range(Vector& v) { values_.keep_in_range(value(v)); }  // of whose derivative rounding is no part
   bool is_preconditioned() const { return values_.is_preconditioned(); }
   Scalar precondition(const Vector& v, Vector& out) {
     const T* from = value(v);
@@ -135,6 +124,61 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
           .a = of});
     return number(Kind::kDot, product, of, out.version);
   }
+
+  // ---- fused operations
+
+  Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
+    xpby(x, beta, y);
+    return number(Kind::kSquare, values_.dot(value(y), value(y)), y.version);
+  }
+  std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
+    const T* from = value(v);
+    const auto of = v.version;
+    const auto dots = values_.apply_with_dots(from, fresh(out));
+    note({.kind = Kind::kApply, .out = out.version, .a = of});
+    const auto first = number(Kind::kDot, dots[0], of, out.version);
+    return {first, number(Kind::kSquare, dots[1], out.version)};
+  }
+  void keep_in_range(Vector& v) { values_.keep_in_range(value(v)); }  // of whose derivative rounding is no part
+
+  // ---- numbers
+
+  void assign(const Scalar& from, Scalar& to) { to = from; }
+  Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2) {
+    const T value = values_.guarded_quotient(num.value, den.value, v2.value, w2.value);
+    return value == T(0) ? Scalar(value) : num / den;
+  }
+  Scalar breaks_down(const Scalar& den, const Scalar& v2, const Scalar& w2, const Scalar& active) const {
+    return values_.breaks_down(den.value, v2.value, w2.value, active.value);
+  }
+  Scalar ratio(const Scalar& num, const Scalar& den) const {
+    const T value = values_.ratio(num.value, den.value);
+    return value == T(0) ? Scalar(value) : num / den;
+  }
+  void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
+    values_.break_down_unless_positive(a.value, r2.value);
+  }
+  Scalar sum_of_squares(const Scalar& v2, const Scalar& a, const Scalar& w2) const {
+    return values_.sum_of_squares(v2.value, a.value, w2.value);
+  }
+  Scalar is_rounding(const Scalar& a, const Scalar& v2, const Scalar& w2, double factor) const {
+    return values_.is_rounding(a.value, v2.value, w2.value, factor);
+  }
+  Scalar unless_zero(const Scalar& a, const Scalar& b, const Scalar& active) const {
+    return b.value != 0 && active.value != 0 ? a : Scalar(0);
+  }
+  Scalar is_not_zero(const Scalar& a) const { return values_.is_not_zero(a.value); }
+  Scalar is_zero(const Scalar& a) const { return values_.is_zero(a.value); }
+  Scalar is_larger(const Scalar& a, const Scalar& b) const { return values_.is_larger(a.value, b.value); }
+  void restore(const Scalar& where, const Vector& from, Vector& to) {
+    if (where.value != 0) copy(from, to);
+  }
+  void restore(const Scalar& where, const Scalar& from, Scalar& to) const {
+    if (where.value != 0) to = from;
+  }
+
+  // ---- sweeps
+
   void divide_by_diagonal(const Vector& b, Vector& c) {
     const T* from = value(b);
     const auto of = b.version;
@@ -160,39 +204,9 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   }
   Scalar radius2() const { return values_.radius2(); }
   bool sweeps_are_log_convex() const { return values_.sweeps_are_log_convex(); }
-  Scalar residual(const Vector& x, Vector& r) {
-    const T* from = value(x);
-    const auto of = x.version;
-    const T rr = values_.residual(from, fresh(r));
-    note({.kind = Kind::kResidual, .out = r.version, .a = of});
-    return number(Kind::kSquare, rr, r.version);
-  }
-  void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
-  std::array<bool, 1> definite_factors(const Vector&) const { return {false}; }
-  Scalar skeel_estimate2(const Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
 
-  Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2) {
-    const T value = values_.guarded_quotient(num.value, den.value, v2.value, w2.value);
-    return value == T(0) ? Scalar(value) : num / den;
-  }
-  Scalar breaks_down(const Scalar& den, const Scalar& v2, const Scalar& w2, const Scalar& active) const {
-    return values_.breaks_down(den.value, v2.value, w2.value, active.value);
-  }
-  Scalar ratio(const Scalar& num, const Scalar& den) const {
-    const T value = values_.ratio(num.value, den.value);
-    return value == T(0) ? Scalar(value) : num / den;
-  }
-  void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
-    values_.break_down_unless_positive(a.value, r2.value);
-  }
-  Scalar is_rounding(const Scalar& a, const Scalar& v2, const Scalar& w2, double factor) const {
-    return values_.is_rounding(a.value, v2.value, w2.value, factor);
-  }
-  Scalar unless_zero(const Scalar& a, const Scalar& b, const Scalar& active) const {
-    return b.value != 0 && active.value != 0 ? a : Scalar(0);
-  }
+  // ---- GMRES
 
-  Scalar constant(const Scalar& a) const { return a.value; }
   void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) {
     plain_.resize(count);
     values_.dots(pointers(v, count), count, factor.value, value(w), plain_.data());
@@ -209,6 +223,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     return values_.lost_orthogonality(left2.value, taken2.value, loss.value);
   }
   Scalar inverse(const Scalar& a, const Scalar& scale) const { return values_.inverse(a.value, scale.value); }
+  Scalar larger(const Scalar& a, const Scalar& b) const { return values_.larger(a.value, b.value); }
   void damp(const Scalar* r, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep, Scalar* y) const {
     const auto plain = [](const Scalar* from, int64_t count) {
       std::vector<T> values(count);
@@ -221,17 +236,16 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     values_.damp(triangle.data(), plain(g, n).data(), n, scale.value, keep.value, found.data());
     std::copy(found.begin(), found.end(), y);
   }
-  Scalar larger(const Scalar& a, const Scalar& b) const { return values_.larger(a.value, b.value); }
-  Scalar is_larger(const Scalar& a, const Scalar& b) const { return values_.is_larger(a.value, b.value); }
-  void restore(const Scalar& where, const Vector& from, Vector& to) {
-    if (where.value != 0) copy(from, to);
-  }
-  void restore(const Scalar& where, const Scalar& from, Scalar& to) const {
-    if (where.value != 0) to = from;
-  }
-  Scalar is_zero(const Scalar& a) const { return values_.is_zero(a.value); }
-  Scalar is_not_zero(const Scalar& a) const { return values_.is_not_zero(a.value); }
   bool surely_all(const Scalar& a) const { return values_.surely_all(a.value); }
+  Scalar constant(const Scalar& a) const { return a.value; }
+  int derivatives() const { return recording_ ? 1 : 0; }
+  bool started() const { return values_.started(); }
+
+  // ---- direct methods, which have no derivative here
+
+  void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
+  Scalar skeel_estimate2(const Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
+  std::array<bool, 1> definite_factors(const Vector&) const { return {false}; }
 
  private:
   using Kind = typename Tape<T>::Kind;

@@ -4,11 +4,13 @@
 
 #include <limits>
 
+#include "prdp/autograd/op_results.h"
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/unrolled_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/solvers/solve_recorded.h"
 
 namespace prdp {
 

@@ -1,19 +1,9 @@
 #pragma once
+#include "prdp/kernels/assembly.h"
 #include "prdp/kernels/stencil.h"
 #include "prdp/kernels/upwind_rows.h"
 
 namespace prdp::kernels {
-
-/// The coefficients of a stencil of nearest neighbours on a periodic grid as contiguous fields.
-template <class T>
-StencilFields<T> raw_stencil(const PackedStencil<T>& rows) {
-  StencilFields<T> a(rows.grid());
-  std::vector<T*> fields;
-  for (const auto& o : rows.pattern().offsets) fields.push_back(a.add(StencilFields<T>::place(o)));
-  const auto& [nz, ny, nx] = rows.grid().shape;
-  rows.for_each_coefficient([&](int64_t row, int64_t k, int64_t i, T value) { fields[k][row * nx + i] = value; });
-  return a;
-}
 
 /// I + dt Γ(w) - ν dt L on each of the `dim` channels, with the winds averaged to the faces; null where a wind is not
 /// finite.
@@ -32,14 +22,15 @@ std::unique_ptr<Kernel<T>> burgers(const UpwindParameters<T>& p, int64_t dim) {
   };
   UpwindTerms terms{factor, p.dt * factor, p.nu * p.dt * factor, p.transposed, p.length_y, p.length_x};
   auto rows = std::make_shared<PackedStencil<T>>(upwind_rows<T>(p.pattern, terms, winds));
-  const auto raw = [p, dim]() -> std::optional<StencilFields<T>> {
+  const auto as_fields = [p, dim]() -> std::optional<StencilFields<T>> {
     auto untransposed = p;
     untransposed.transposed = false;
     const auto kernel = burgers(untransposed, dim);
-    return raw_stencil(dynamic_cast<const Stencil<T>&>(*kernel).coefficients());
+    return fields_of(dynamic_cast<const Stencil<T>&>(*kernel).coefficients());
   };
-  return std::make_unique<Stencil<T>>(std::move(rows), dim, static_cast<T>(factor),
-                                      typename Stencil<T>::Source{[p, dim] { return p.key(dim); }, raw, p.transposed});
+  return std::make_unique<Stencil<T>>(
+      std::move(rows), dim, static_cast<T>(factor),
+      typename Stencil<T>::Source{[p, dim] { return p.key(dim); }, as_fields, p.transposed});
 }
 
 }  // namespace prdp::kernels

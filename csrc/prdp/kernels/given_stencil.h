@@ -1,63 +1,10 @@
 #pragma once
 #include <numeric>
 
+#include "prdp/kernels/assembly.h"
 #include "prdp/kernels/stencil.h"
 
 namespace prdp::kernels {
-
-/// A run of points along an axis: `count` points from index `to` on take the values of those
-/// from index `from` on.
-struct Run {
-  int64_t to, from, count;
-};
-
-/// The coefficients of the points that have a neighbour at `offset`: their own or, in the transpose, those of the
-/// neighbour.
-inline std::array<Run, 2> runs(int64_t offset, int64_t n, bool periodic, bool transposed) {
-  if (periodic && (!transposed || offset == 0)) return {{{0, 0, n}}};
-  const int64_t begin = std::max<int64_t>(-offset, 0);
-  const Run inner{begin, transposed ? begin + offset : begin, n - std::abs(offset)};
-  if (!periodic) return {inner};
-  return {{inner, offset > 0 ? Run{n - offset, 0, offset} : Run{0, n + offset, -offset}}};
-}
-
-/// The rows of factor times the stencil with these coefficients, each (nz, ny, nx) and one for each offset that
-/// `pattern` was given; or of its transpose: the stencil of the opposite offsets, of which `pattern` is then to be.
-template <class T>
-PackedStencil<T> assemble_rows(std::shared_ptr<const StencilSparsity> pattern,
-                               const std::vector<const T*>& coefficients, T factor, bool transposed) {
-  PackedStencil<T> a(pattern);
-  const auto& [nz, ny, nx] = pattern->grid.shape;
-  const auto& loops = kernels::loops<T>();
-  std::vector<bool> holds(pattern->offsets.size());
-  for (size_t given = 0; given < coefficients.size(); ++given) {
-    const int64_t k = pattern->places[given];
-    if (k < 0) continue;
-    const auto along = [&](int axis) {
-      return runs(pattern->offsets[k].along[axis], pattern->grid.shape[axis], pattern->grid.periodic[axis], transposed);
-    };
-    for (const Run& z : along(0))
-      for (int64_t plane = 0; plane < z.count; ++plane)
-        for (const Run& y : along(1))
-          for (const Run& x : along(2)) {
-            if (y.count == 0 || x.count == 0) continue;
-            T* to = a.coefficient((z.to + plane) * ny + y.to, k) + x.to;
-            const T* source = coefficients[given] + ((z.from + plane) * ny + y.from) * nx + x.from;
-            for_each_run_of_rows(y.count, x.count, [&](int64_t begin, int64_t end) {
-              if (!holds[k]) {
-                loops.copy_rows(factor, source + begin * nx, nx, to + begin * a.stride(), a.stride(), end - begin,
-                                x.count);
-                return;
-              }
-              for (int64_t r = begin; r < end; ++r)
-                for (int64_t i = 0; i < x.count; ++i) to[r * a.stride() + i] += factor * source[r * nx + i];
-            });
-          }
-    holds[k] = true;
-  }
-  a.close();
-  return a;
-}
 
 /// The row sums that products keep, see PackedStencil::set_row_sums(): (batch, nz, ny, nx), or one number for all.
 template <class T>
@@ -122,17 +69,15 @@ struct GivenStencil {
     const T factor = scale_of_operator(magnitude);
     auto rows = std::make_shared<PackedStencil<T>>(assemble_rows(pattern, fields, factor, transposed));
     const T* const values_of_sample = row_sums.values ? row_sums.values + s * row_sums.sample_stride : nullptr;
-    if (values_of_sample) this->set_row_sums(*rows, values_of_sample, fields, factor);
-    const auto key = [given_stencil = *this, from, values_of_sample, count = given * points, points] {
-      auto made = given_stencil.of_matrix().add_field(from, count);
-      return values_of_sample ? made.add_field(values_of_sample, given_stencil.row_sums.is_number ? 1 : points).key()
-                              : made.key();
+    if (values_of_sample) set_row_sums(*rows, values_of_sample, fields, factor);
+    // Both outlive this struct, of which they hold a copy.
+    const auto key = [*this, from, values_of_sample, count = given * points, points] {
+      auto made = key_of_pattern().add_field(from, count);
+      return values_of_sample ? made.add_field(values_of_sample, row_sums.is_number ? 1 : points).key() : made.key();
     };
-    const auto raw = [given_stencil = *this, fields, factor, points] {
-      return given_stencil.raw(fields, factor, points);
-    };
+    const auto as_fields = [*this, fields, factor, points] { return fields_of_multigrid(fields, factor, points); };
     return std::make_unique<Stencil<T>>(std::move(rows), channels, factor,
-                                        typename Stencil<T>::Source{key, raw, transposed});
+                                        typename Stencil<T>::Source{key, as_fields, transposed});
   }
 
  private:
@@ -172,7 +117,7 @@ struct GivenStencil {
     loops.add_product(field + r * nx + x.to + x.count, zeros, row + x.to + x.count, nx - x.to - x.count);
   }
   /// The part of the key that tells the grid and the offsets, as they are in the matrix that is not transposed.
-  FactorKeyMaker of_matrix() const {
+  FactorKeyMaker key_of_pattern() const {
     FactorKeyMaker key;
     const auto& grid = pattern->grid;
     for (int d = 0; d < 3; ++d) key.add(grid.shape[d]).add(int64_t{grid.periodic[d]});
@@ -189,7 +134,8 @@ struct GivenStencil {
     return o;
   }
   /// The coefficients, times the factor, as multigrid takes them; nothing if neighbours lie further away.
-  std::optional<StencilFields<T>> raw(const std::vector<const T*>& fields, T factor, int64_t points) const {
+  std::optional<StencilFields<T>> fields_of_multigrid(const std::vector<const T*>& fields, T factor,
+                                                      int64_t points) const {
     StencilFields<T> a(pattern->grid);
     for (size_t given = 0; given < fields.size(); ++given) {
       const int64_t k = pattern->places[given];

@@ -5,9 +5,9 @@
 #include <cmath>
 #include <limits>
 
+#include "prdp/kernels/assembly.h"
 #include "prdp/kernels/coarsening.h"
 #include "prdp/kernels/galerkin.h"
-#include "prdp/kernels/given_stencil.h"
 
 namespace prdp::kernels {
 

@@ -112,17 +112,17 @@ class Laplacian final : public Kernel<T> {
     return {layout().rows, layout().planes, layout().row, layout().plane, centre_, weights.data()};
   }
   /// A large sample in parts for several threads: values of the only row, rows of the only plane, or planes.
-  int64_t each() const {
+  int64_t size_of_part() const {
     if constexpr (Dim == 1) return kBlock;
     return std::max<int64_t>(kBlock / (Dim == 2 ? layout().row : layout().plane), 1);
   }
-  int64_t in_all() const { return Dim == 1 ? layout().row : Dim == 2 ? layout().rows : layout().planes; }
-  int64_t parts() const { return length() <= kBlock ? 1 : std::max<int64_t>(in_all() / each(), 1); }
+  int64_t size_in_all() const { return Dim == 1 ? layout().row : Dim == 2 ? layout().rows : layout().planes; }
+  int64_t parts() const { return length() <= kBlock ? 1 : std::max<int64_t>(size_in_all() / size_of_part(), 1); }
   /// Part p, and where it begins.
   std::pair<ConstantStencil<T>, int64_t> part(int64_t p, const std::vector<T>& weights) const {
     auto a = stencil(weights);
     if (parts() == 1) return {a, 0};
-    const int64_t first = p * each(), count = p + 1 < parts() ? each() : in_all() - first;
+    const int64_t first = p * size_of_part(), count = p + 1 < parts() ? size_of_part() : size_in_all() - first;
     if constexpr (Dim == 1) {
       a.row = count;
       a.weights += first;

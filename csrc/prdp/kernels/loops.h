@@ -140,7 +140,7 @@ struct Loops {
   void (*apply[3])(const ConstantStencil<T>& a, const T* v, T* out, T* dots);
   /// n sweeps x ← c + (neighbours of x, weighted). Returns the one of x and y that holds the result; the
   /// other one is overwritten. With omega, one for each sweep, x ← y + omega (that - y) instead, where y
-  /// holds the iterate before x, before and after.
+  /// holds the iterate before x, on entry and on return.
   T* (*sweeps[3])(const ConstantStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega);
   /// One of them, with its result in y; returns ‖c + neighbours - x‖².
   T (*sweep_and_measure[3])(const ConstantStencil<T>& a, const T* c, const T* x, T* y, const T* omega);
@@ -150,8 +150,8 @@ struct Loops {
   /// either side. Sets lower and upper, adds to centre; any n.
   void (*upwind_row)(T advection, T diffusion, const T* before, const T* here, const T* after, T* lower, T* upper,
                      T* centre, int64_t n);
-  /// On the rows that `lines` names. By the number of dimensions less one: out = A v; dots += {v·out, ‖out‖²} unless
-  /// it is null.
+  /// On the rows that `lines` names, by the number of dimensions less one: out = A v, and dots += {v·out, ‖out‖²}
+  /// unless that is null.
   void (*apply_neighbours[3])(const NeighbourStencil<T>& a, Lines lines, const T* v, T* out, T* dots);
   void (*apply_offsets)(const OffsetStencil<T>& a, Lines lines, const T* v, T* out, T* dots);
   /// A Jacobi sweep y = x + c - D⁻¹A x; *squares += ‖D(y - x)‖² unless it is null.
@@ -159,8 +159,8 @@ struct Loops {
   void (*sweep_offsets)(const OffsetStencil<T>& a, Lines lines, const T* c, const T* x, T* y, T* squares);
   void (*apply_staggered)(const StaggeredStencil<T>& a, Lines lines, const T* v, T* out);
 
-  /// A smoothing step y = x + p (x - y) + q D⁻¹(b - A x); y holds the iterate before x, before, and the one after it,
-  /// after. On Laplacians the same with 1/D for the last argument.
+  /// A smoothing step y = x + p (x - y) + q D⁻¹(b - A x): on entry y is the iterate before x, on return the one after
+  /// it. On Laplacians the same with 1/D for the last argument.
   void (*smooth_neighbours[3])(const NeighbourStencil<T>& a, Lines lines, const T* b, const T* x, T* y, T p, T q);
   void (*smooth_offsets)(const OffsetStencil<T>& a, Lines lines, const T* b, const T* x, T* y, T p, T q);
   void (*smooth[3])(const ConstantStencil<T>& a, const T* b, const T* x, T* y, T p, T q, T inverse_diagonal);

@@ -21,10 +21,10 @@ class PackedStencil {
         nx_(pattern_->grid.shape[2]),
         row_(round_up_to_lanes<T>(nx_)),
         count_(static_cast<int64_t>(pattern_->offsets.size())),
-        coupled_(!pattern_->grid.periodic[2] ? 0
-                 : pattern_->nearest         ? 2 * kLanes<T>
-                                             : static_cast<int64_t>(pattern_->wraps.size())),
-        memory_(zeros<T>(rows() * (count_ * row_ + coupled_) + kLanes<T>)) {
+        wrap_count_(!pattern_->grid.periodic[2] ? 0
+                    : pattern_->nearest         ? 2 * kLanes<T>
+                                                : static_cast<int64_t>(pattern_->wraps.size())),
+        memory_(zeros<T>(rows() * (count_ * row_ + wrap_count_) + kLanes<T>)) {
     const auto address = reinterpret_cast<std::uintptr_t>(memory_.data());
     coefficients_ = reinterpret_cast<T*>((address + 63) / 64 * 64);
   }
@@ -142,7 +142,7 @@ class PackedStencil {
             nx_,
             row_,
             coefficients_,
-            coupled_ ? coupled(0) : nullptr,
+            wrap_count_ ? wrap_values(0) : nullptr,
             row_sums_.empty() ? nullptr : row_sums_.data(),
             row_sum_step_};
   }
@@ -158,10 +158,10 @@ class PackedStencil {
         const T* row = coefficient(r, k);
         for (int64_t i = 0; i < nx_; ++i) sums[i] += std::abs(row[i]);
       }
-      for (size_t e = 0; e < pattern_->wraps.size(); ++e) sums[pattern_->wraps[e].to] += std::abs(coupled(r)[e]);
-      if (pattern_->nearest && coupled_) {
-        sums[0] += std::abs(coupled(r)[0]);
-        sums[nx_ - 1] += std::abs(coupled(r)[kLanes<T> + (nx_ - 1) % kLanes<T>]);
+      for (size_t e = 0; e < pattern_->wraps.size(); ++e) sums[pattern_->wraps[e].to] += std::abs(wrap_values(r)[e]);
+      if (pattern_->nearest && wrap_count_) {
+        sums[0] += std::abs(wrap_values(r)[0]);
+        sums[nx_ - 1] += std::abs(wrap_values(r)[kLanes<T> + (nx_ - 1) % kLanes<T>]);
       }
       largest = std::max(largest, largest_magnitude(sums.data(), nx_));
     }
@@ -198,10 +198,10 @@ class PackedStencil {
 
  private:
   void close_row(int64_t r) {
-    T* const to = coupled(r);
+    T* const to = wrap_values(r);
     for (size_t e = 0; e < pattern_->wraps.size(); ++e)
       to[e] = coefficient(r, pattern_->wraps[e].coefficient)[pattern_->wraps[e].to];
-    if (pattern_->nearest && coupled_) {
+    if (pattern_->nearest && wrap_count_) {
       to[0] = coefficient(r, 1)[0];
       to[kLanes<T> + (nx_ - 1) % kLanes<T>] = coefficient(r, 2)[nx_ - 1];
     }
@@ -213,27 +213,28 @@ class PackedStencil {
     }
   }
 
-  const T* coupled(int64_t r) const { return coefficients_ + rows() * stride() + r * coupled_; }
-  T* coupled(int64_t r) { return coefficients_ + rows() * stride() + r * coupled_; }
+  const T* wrap_values(int64_t r) const { return coefficients_ + rows() * stride() + r * wrap_count_; }
+  T* wrap_values(int64_t r) { return coefficients_ + rows() * stride() + r * wrap_count_; }
   OffsetStencil<T> offsets() const {
     const auto& n = grid().shape;
-    return {
-        n[0],      n[1], nx_, row_, count_, pattern_->offsets.data(), coefficients_, coupled_, pattern_->wraps.data(),
-        coupled(0)};
+    return {n[0],          n[1],        nx_,
+            row_,          count_,      pattern_->offsets.data(),
+            coefficients_, wrap_count_, pattern_->wraps.data(),
+            wrap_values(0)};
   }
 
   /// What couples point i to the one at offset x along its own row, which leaves the row.
   T wrapped(int64_t r, int64_t k, int64_t i) const {
-    if (pattern_->nearest) return coupled(r)[k == 1 ? 0 : kLanes<T> + i % kLanes<T>];
+    if (pattern_->nearest) return wrap_values(r)[k == 1 ? 0 : kLanes<T> + i % kLanes<T>];
     const auto& wraps = pattern_->wraps;
     size_t e = 0;
     while (wraps[e].coefficient != k || wraps[e].to != i) ++e;
-    return coupled(r)[e];
+    return wrap_values(r)[e];
   }
 
   std::shared_ptr<const StencilSparsity> pattern_;
   int64_t nx_, row_, count_;
-  int64_t coupled_;  // values for what leaves a row
+  int64_t wrap_count_;  // numbers of a row for what leaves it: the wraps of an OffsetStencil, or ends
   Field<T> memory_;
   Field<T> row_sums_;  // see set_row_sums()
   int64_t row_sum_step_ = 0;

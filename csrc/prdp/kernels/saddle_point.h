@@ -2,9 +2,10 @@
 #include <memory>
 #include <vector>
 
-#include "prdp/kernels/burgers.h"
+#include "prdp/kernels/assembly.h"
 #include "prdp/kernels/multigrid.h"
 #include "prdp/kernels/navier_stokes.h"
+#include "prdp/kernels/stencil.h"
 
 namespace prdp::kernels {
 
@@ -71,8 +72,8 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
       for (int64_t k = 0; k < 5; ++k) std::fill_n(rows->coefficient(j, k), p.nx, along[k]);
     rows->close();
     const auto key = [p] { return FactorKeyMaker().add(p.ny).add(p.nx).add(p.length_y).add(p.length_x).key(); };
-    const auto raw = [rows]() -> std::optional<StencilFields<T>> { return raw_stencil(*rows); };
-    return std::make_unique<Stencil<T>>(rows, 1, T(1), typename Stencil<T>::Source{key, raw, false});
+    const auto as_fields = [rows]() -> std::optional<StencilFields<T>> { return fields_of(*rows); };
+    return std::make_unique<Stencil<T>>(rows, 1, T(1), typename Stencil<T>::Source{key, as_fields, false});
   }
 
   int64_t plane() const { return a_.layout().plane; }

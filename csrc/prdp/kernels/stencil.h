@@ -18,7 +18,7 @@ class Stencil final : public Kernel<T> {
   /// What the rows were made of; `transposed` says which way round.
   struct Source {
     std::function<FactorKey()> key;                    // of the matrix that is not transposed
-    std::function<std::optional<StencilFields<T>>()> raw;  // its coefficients; nothing if neighbours lie far away
+    std::function<std::optional<StencilFields<T>>()> as_fields;  // its coefficients; nothing if neighbours lie far away
     bool transposed = false;
   };
 
@@ -98,14 +98,14 @@ class Stencil final : public Kernel<T> {
   std::shared_ptr<const Factors<T>> factorise() const override;
   void leave_source() override {
     source_.key = [key = source_.key()] { return key; };
-    source_.raw = nullptr;
+    source_.as_fields = nullptr;
   }
   int64_t bytes() const override {
     return Base::bytes() + layout().rows * coefficients_.stride() * static_cast<int64_t>(sizeof(T));
   }
   std::optional<GridOperator<T>> grid_operator() const override {
-    if (!source_.raw) return std::nullopt;
-    return GridOperator<T>{source_.raw, source_.key(), source_.transposed};
+    if (!source_.as_fields) return std::nullopt;
+    return GridOperator<T>{source_.as_fields, source_.key(), source_.transposed};
   }
 
  private:

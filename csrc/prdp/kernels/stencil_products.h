@@ -1,5 +1,5 @@
 #pragma once
-#include "prdp/kernels/given_stencil.h"
+#include "prdp/kernels/assembly.h"
 
 namespace prdp::kernels {
 

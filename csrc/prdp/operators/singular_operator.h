@@ -15,6 +15,9 @@ OperatorSpec with_null_space(OperatorSpec a, const at::Tensor& right = {}, std::
 /// parameters, u̇ has the part -N (NᵀN)⁻¹ Ṅᵀ u beside that of b and A. `basis`: as SingularOperator's.
 at::Tensor follow_null_space(const at::Tensor& u, const at::Tensor& basis);
 
+/// v with the unknowns that a vector of a basis has as its last axis: those of a channel, or of all.
+at::Tensor by_vector(const at::Tensor& v, bool spans_channels);
+
 /// A singular operator together with its null spaces, which its user names: vectors that A maps to zero (right), and
 /// such that Aᵀ maps to zero (left). Right-hand sides and cotangents are projected onto what A, or Aᵀ, can reach, and
 /// solutions onto those of least norm. A right-hand side with a part outside, beyond rtol, is INCONSISTENT. Its kind is

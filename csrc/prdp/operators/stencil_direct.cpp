@@ -22,6 +22,11 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
+// Two kinds of stencils have a cheap way: those in 1D, by cyclic reduction where they are diagonally dominant
+// (solve_line), and symmetric sums of operators along the axes, in their eigenvectors (solve_sum). The others, or the
+// samples that are of neither kind, take a dense matrix (solve_densely). The derivative is the same for all
+// (SolveStencil).
+
 /// A solve that is cheap, for some samples of a batch or for all.
 struct FastSolve {
   std::function<at::Tensor(const at::Tensor& b)> solve;  // empty: there is none for any sample

@@ -31,9 +31,36 @@ inline bool energy_falls(const InnerProducts& e, double epsilon, bool surely_def
   return symmetric && definite && nearer && not_rounding;
 }
 
+/// Those of every sample, by one product of the whole batch.
+template <class Space, class Method>
+auto inner_products(Space& space, Method& method, const typename Space::States& states) {
+  const auto& x = method.x;
+  const auto &r = method.residual(), &b = space.b();
+  auto ar = space.scratch();
+  space.apply(r, ar);
+  auto all = space.map(states, [](const SampleState&) { return InnerProducts{}; });
+  const auto set = [&](double InnerProducts::* product, const auto& value) {
+    const auto values = space.values_of(value);
+    for (size_t i = 0; i < all.size(); ++i) all[i].*product = values[i];
+  };
+  set(&InnerProducts::x_b, space.dot(x, b));
+  set(&InnerProducts::x_r, space.dot(x, r));
+  set(&InnerProducts::r_b, space.dot(r, b));
+  set(&InnerProducts::r_r, space.dot(r, r));
+  set(&InnerProducts::b_b, space.dot(b, b));
+  set(&InnerProducts::x_Ar, space.dot(x, ar));
+  set(&InnerProducts::r_Ar, space.dot(r, ar));
+  set(&InnerProducts::x_x, space.dot(x, x));
+  set(&InnerProducts::Ar_Ar, space.dot(ar, ar));
+  space.fill_zero(ar);
+  const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(x));  // ‖A‖ and u without their scale
+  for (size_t i = 0; i < all.size(); ++i) all[i].norm_A_x_x = norm_a[i] * std::sqrt(u2[i] * all[i].x_x);
+  return all;
+}
+
 /// Of the samples that ended above ‖b‖: where the energy falls, the last iterate is handed out; else the sample is
 /// DIVERGED. One that broke down is left alone: its A is not definite, and the energy says nothing. For a method whose
-/// residual is the true one. One product of the whole batch, which counts for these samples alone.
+/// residual is the true one.
 template <class Space, class Method>
 void accept_by_energy(Space& space, Method& method, typename Space::States& states) {
   const auto is_above = [](const SampleState& s) {
@@ -42,27 +69,16 @@ void accept_by_energy(Space& space, Method& method, typename Space::States& stat
   if (std::none_of(states.begin(), states.end(), is_above)) return;
   const auto before = states;
   space.freeze_unless(states, [](const SampleState&) { return true; });
-  const auto& x = method.x;
-  const auto &r = method.residual(), &b = space.b();
-  auto ar = space.scratch();
-  space.apply(r, ar);
-  const auto values_of = [&](const auto& v, const auto& w) { return space.values_of(space.dot(v, w)); };
-  const auto x_b = values_of(x, b), x_r = values_of(x, r), r_b = values_of(r, b), r_r = values_of(r, r),
-             b_b = values_of(b, b);
-  const auto x_Ar = values_of(x, ar), r_Ar = values_of(r, ar), x_x = values_of(x, x), Ar_Ar = values_of(ar, ar);
-  space.fill_zero(ar);
-  const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(x));  // ‖A‖ and u without their scale
+  const auto products = inner_products(space, method, states);
   const auto definite = space.surely_definite();
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     if (!is_above(s)) {
-      s.applications = before[i].applications;
+      s.applications = before[i].applications;  // the product counts for the others alone
       continue;
     }
     s.returned = Returned::kLast;
-    const double norm_A_x_x = norm_a[i] * std::sqrt(u2[i] * x_x[i]);
-    const InnerProducts e{x_b[i], x_r[i], r_b[i], r_r[i], b_b[i], x_Ar[i], r_Ar[i], x_x[i], Ar_Ar[i], norm_A_x_x};
-    if (!energy_falls(e, space.epsilon(), definite[i])) s.status = SolveStatus::kDiverged;
+    if (!energy_falls(products[i], space.epsilon(), definite[i])) s.status = SolveStatus::kDiverged;
   }
 }
 

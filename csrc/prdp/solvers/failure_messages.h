@@ -1,7 +1,7 @@
 #pragma once
 #include <string>
 
-#include "prdp/solvers/solve.h"
+#include "prdp/solvers/report_failures.h"
 
 namespace prdp {
 

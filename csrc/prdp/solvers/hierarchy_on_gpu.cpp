@@ -26,7 +26,8 @@ int64_t offsets_of(const at::Tensor& b) {
 }
 
 /// Points of all coarse grids together, those between two axes included, at most: which axes are coarsened, and in what
-/// order, is known to the device alone.
+/// order, is known to the device alone. Each step makes one axis shorter, so it is the longest path over the sizes that
+/// the three axes can have.
 int64_t most_coarse_points(at::IntArrayRef shape) {
   std::vector<std::vector<int64_t>> sizes(3, {1});
   for (size_t d = 0; d < shape.size(); ++d) {
@@ -34,25 +35,26 @@ int64_t most_coarse_points(at::IntArrayRef shape) {
     while (sizes[d].back() > 1) sizes[d].push_back(kernels::coarse_points(sizes[d].back(), /*periodic=*/true));
   }
   const auto count = [&](size_t d) { return sizes[d].size(); };
-  std::vector<int64_t> most(count(0) * count(1) * count(2), 0);  // from each combination of sizes on
+  std::vector<int64_t> most_from(count(0) * count(1) * count(2), 0);  // each combination of sizes on
   const auto place = [&](size_t i, size_t j, size_t k) { return (i * count(1) + j) * count(2) + k; };
   for (size_t i = count(0); i-- > 0;)
     for (size_t j = count(1); j-- > 0;)
       for (size_t k = count(2); k-- > 0;) {
-        const auto points_from = [&](size_t a, size_t b, size_t c) {
+        const auto points_with = [&](size_t a, size_t b, size_t c) {
           if (a == count(0) || b == count(1) || c == count(2)) return int64_t{0};
-          return sizes[0][a] * sizes[1][b] * sizes[2][c] + most[place(a, b, c)];
+          return sizes[0][a] * sizes[1][b] * sizes[2][c] + most_from[place(a, b, c)];
         };
-        most[place(i, j, k)] = std::max({points_from(i + 1, j, k), points_from(i, j + 1, k), points_from(i, j, k + 1)});
+        most_from[place(i, j, k)] =
+            std::max({points_with(i + 1, j, k), points_with(i, j + 1, k), points_with(i, j, k + 1)});
       }
-  return most[0];
+  return most_from[0];
 }
 
 template <class T>
 void launch(const HierarchyKernel& kernel, const at::Tensor& hierarchy) {
-  constexpr int64_t of_inverse = numbers_of_inverse(kMostOfCoarsest) * static_cast<int64_t>(sizeof(double));
+  constexpr int64_t bytes_of_inverse = numbers_of_inverse(kMostOfCoarsest) * static_cast<int64_t>(sizeof(double));
   const int64_t teams = std::min(hierarchy.size(0), kernel.kernel->teams());
-  const TeamMemory memory(kernel.blocks_of_team, teams, hierarchy.options(), teams * of_inverse);
+  const TeamMemory memory(kernel.blocks_of_team, teams, hierarchy.options(), teams * bytes_of_inverse);
   HierarchyArguments<T> arguments{};
   arguments.a = arguments_of(kernel.a);
   arguments.grids = grids_of(hierarchy);
@@ -90,9 +92,9 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
 }
 
 at::Tensor make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b) {
-  const auto of_grids = static_cast<int64_t>(sizeof(Grids) / b.element_size());
+  const auto numbers_of_grids = static_cast<int64_t>(sizeof(Grids) / b.element_size());
   const auto hierarchy =
-      at::empty({is_shared(kernel.a) ? 1 : b.size(0), of_grids + kernel.numbers_of_sample}, b.options());
+      at::empty({is_shared(kernel.a) ? 1 : b.size(0), numbers_of_grids + kernel.numbers_of_sample}, b.options());
   (b.scalar_type() == at::kFloat ? launch<float> : launch<double>)(kernel, hierarchy);
   return hierarchy;
 }

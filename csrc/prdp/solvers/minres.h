@@ -46,11 +46,7 @@ class MinresMethod {
   }
   void step() {
     const Scalar inverse = space_.ratio(one_, gamma_);
-    const Scalar delta = space_.apply_with_dots(space_.is_preconditioned() ? z_ : v_, az_)[0] * inverse * inverse;
-    // next = A z/γ - (δ/γ) v - (γ/γ₋) v₋, the next Lanczos vector
-    combine_into_next(az_, inverse, v_, -delta * inverse, last_v_, -space_.ratio(coupling_, last_gamma_));
-    space_.keep_in_range(next_);  // where rounding grows as fast as the residual falls
-    shift_in_next(v_, last_v_);  // v of this iteration is last_v_ from here on
+    const Scalar delta = make_lanczos_vector(inverse);  // v of this iteration is last_v_ from here on
     const Vector& z = space_.is_preconditioned() ? z_ : last_v_;
     const Scalar square = space_.is_preconditioned() ? space_.precondition(v_, next_z_) : space_.dot(v_, v_);
     const Scalar zero = space_.is_zero(square);
@@ -68,9 +64,7 @@ class MinresMethod {
     s_ = space_.ratio(gamma, a1);
     combine_into_next(z, inverse * space_.ratio(one_, a1), w_, -space_.ratio(a2, a1), last_w_, -space_.ratio(a3, a1));
     shift_in_next(w_, last_w_);
-    parts_[0] = w_;
-    weights_[0] = c_ * eta_ * is_not_negative;
-    space_.add_combination(weights_.data(), parts_, 1, x);
+    move_along_w(c_ * eta_ * is_not_negative);
     eta_ = -s_ * eta_;
     last_gamma_ = gamma_;
     gamma_ = coupling_ = gamma;
@@ -106,6 +100,20 @@ class MinresMethod {
     space_.assign(gamma_, eta_);
     for (auto* number : {&last_gamma_, &c_, &last_c_}) space_.assign(one_, *number);
     for (auto* number : {&coupling_, &s_, &last_s_}) space_.assign(zero, *number);
+  }
+  /// v = A z/γ - (δ/γ) v - (γ/γ₋) v₋, with 1/γ given; returns δ.
+  Scalar make_lanczos_vector(const Scalar& inverse) {
+    const Scalar delta = space_.apply_with_dots(space_.is_preconditioned() ? z_ : v_, az_)[0] * inverse * inverse;
+    combine_into_next(az_, inverse, v_, -delta * inverse, last_v_, -space_.ratio(coupling_, last_gamma_));
+    space_.keep_in_range(next_);  // where rounding grows as fast as the residual falls
+    shift_in_next(v_, last_v_);
+    return delta;
+  }
+  /// x += length w
+  void move_along_w(const Scalar& length) {
+    parts_[0] = w_;
+    weights_[0] = length;
+    space_.add_combination(weights_.data(), parts_, 1, x);
   }
   /// The square of ‖r‖; with a preconditioner r = s² r + c η v/γ, whose norm η alone does not tell.
   void take_residual() {

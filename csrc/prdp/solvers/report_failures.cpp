@@ -1,3 +1,5 @@
+#include "prdp/solvers/report_failures.h"
+
 #include <c10/util/Exception.h>
 
 #include <algorithm>
@@ -5,25 +7,17 @@
 #include <map>
 #include <mutex>
 #include <sstream>
-#include <utility>
 
 #include "prdp/error_text.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/failure_messages.h"
 #include "prdp/solvers/methods.h"
-#include "prdp/solvers/raise_or_warn.h"
 #include "prdp/solvers/unfit.h"
+#include "prdp/solvers/warnings.h"
 
 namespace prdp {
 
 namespace {
-
-WarningSink& warning_sink() {
-  static WarningSink sink = [](const std::string& text) { TORCH_WARN(text); };
-  return sink;
-}
-
-thread_local int64_t step_now = 0, steps_in_all = 0;  // of a rollout, while it runs
 
 /// "(0, 17)"
 std::string position(const std::vector<int64_t>& index) {
@@ -50,33 +44,6 @@ std::string whereabouts(const Operator& a, const at::Tensor& b, const at::Tensor
   if (status == SolveStatus::kNonfiniteOperator)
     if (const auto index = a.first_nonfinite(sample); !index.empty()) text << " at index " << position(index);
   return text.str();
-}
-
-/// "step 3 of 10: "; nothing outside of a rollout.
-std::string of_step() {
-  return step_now > 0 ? "step " + std::to_string(step_now) + " of " + std::to_string(steps_in_all) + ": " : "";
-}
-
-/// Whether nobody has said so yet, or only of what is less than a tenth as bad.
-bool should_warn_again(const std::string& what, double size) {
-  static std::mutex mutex;
-  static std::map<std::string, double> said;
-  const std::lock_guard lock(mutex);
-  const auto [at, is_first] = said.try_emplace(what, size);
-  const bool is_worse = !is_first && size > 10.0 * at->second;
-  if (is_worse) at->second = size;
-  return is_first || is_worse || c10::WarningUtils::get_warnAlways();
-}
-
-/// Warns with what `say` writes, the first time for this `key`, and again where it is ten times as bad.
-template <class Say>
-void warn_once(const std::string& key, double size, const Say& say) {
-  if (!should_warn_again(key, size)) return;
-  std::ostringstream text;
-  text << of_step();
-  say(text);
-  text << (size > 0.0 ? ". This is said once, and again if it gets ten times worse" : ". This is said once");
-  warning_sink()(text.str());
 }
 
 const char* name_of(const SolveRole& role) { return role.adjoint ? "adjoint solve" : "linear_solve"; }
@@ -199,32 +166,25 @@ bool warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor&
   const auto iterations = to_host<int64_t>(info.iterations, b.size(0)),
              status = to_host<int64_t>(info.status, b.size(0));
   const auto residual = to_host<double>(info.residual, b.size(0));
-  std::vector<int64_t> vain;
+  std::vector<int64_t> stopped_worse;
   for (int64_t i = 0; i < b.size(0); ++i)
     if (later_iterations_were_worse(role.solver, static_cast<SolveStatus>(status[i]), iterations[i], residual[i]))
-      vain.push_back(i);
-  if (vain.empty()) return warn_of_growth(role, a, b, status, residual);
-  warn_once("in vain: " + key_of(role), residual[vain.front()], [&, first = vain.front()](std::ostream& text) {
-    text << name_of(role) << ": " << vain.size() << " of " << b.size(0)
-         << " samples ended far above rtol = " << role.solver.rtol << ": sample " << first << " returned "
-         << (iterations[first] > 0 ? "iterate " + std::to_string(iterations[first])
-             : role.x0.defined()   ? "its start"
-                                   : "zero")
-         << " at relative residual " << residual[first] << ", as the last of " << role.solver.max_iter
-         << " iterates was worse, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first);
-  });
+      stopped_worse.push_back(i);
+  if (stopped_worse.empty()) return warn_of_growth(role, a, b, status, residual);
+  warn_once("in vain: " + key_of(role), residual[stopped_worse.front()],
+            [&, first = stopped_worse.front()](std::ostream& text) {
+              text << name_of(role) << ": " << stopped_worse.size() << " of " << b.size(0)
+                   << " samples ended far above rtol = " << role.solver.rtol << ": sample " << first << " returned "
+                   << (iterations[first] > 0 ? "iterate " + std::to_string(iterations[first])
+                       : role.x0.defined()   ? "its start"
+                                             : "zero")
+                   << " at relative residual " << residual[first] << ", as the last of " << role.solver.max_iter
+                   << " iterates was worse, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first);
+            });
   return true;
 }
 
 }  // namespace
-
-FailuresOfStep::FailuresOfStep(int64_t step, int64_t steps)
-    : step_before_(std::exchange(step_now, step)), steps_before_(std::exchange(steps_in_all, steps)) {}
-FailuresOfStep::~FailuresOfStep() {
-  step_now = step_before_;
-  steps_in_all = steps_before_;
-}
-std::pair<int64_t, int64_t> FailuresOfStep::now() { return {step_now, steps_in_all}; }
 
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure) {
@@ -246,10 +206,10 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
     if (!have_stopped && !have_stagnated && !unsolved.empty()) warn_of_unfit(role, a, b, info, unsolved);
     return;
   }
-  const auto is_of_a = [&](int64_t i) {
+  const auto has_nonfinite_operator = [&](int64_t i) {
     return static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator;
   };
-  if (std::any_of(failed.begin(), failed.end(), is_of_a))  // a kernel may have found it
+  if (std::any_of(failed.begin(), failed.end(), has_nonfinite_operator))  // a kernel may have found it
     a.check_parameters(checks_of(on_failure));
 
   constexpr size_t named = 4;
@@ -290,19 +250,5 @@ void warn_of_another_transpose(const void* code, int64_t sample, double of_solve
          << in_language(" prdp.check_operator tells", "");
   });
 }
-
-void raise_or_warn(const std::string& text, OnFailure on_failure) {
-  std::ostringstream whole;
-  whole << of_step() << text;
-  if (on_failure == OnFailure::kRaise)
-    whole << ". With " << in_language("on_failure=\"return\"", "OnFailure::kReturn")
-          << ", what there is comes back with the status of each sample; with "
-          << in_language("\"zero_grad\"", "OnFailure::kZeroGrad")
-          << " the failed ones have no gradient, and a training goes on";
-  TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, whole.str());
-  warning_sink()(whole.str());
-}
-
-void set_warning_sink(WarningSink sink) { warning_sink() = sink; }
 
 }  // namespace prdp

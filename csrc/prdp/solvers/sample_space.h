@@ -132,8 +132,8 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     system_.preconditioner()->apply_transpose(v, out);
   }
   void divide_by_diagonal(const T* b, Vector c) { system_.a().divide_by_diagonal(b, c); }
-  /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖². With
-  /// omega, Chebyshev's, where next holds the iterate before x, before and (the n) after.
+  /// n Jacobi sweeps of x, for which next is memory; and one from x to next, which returns ‖b - A x‖². With omega,
+  /// Chebyshev's, where next holds the iterate before x, on entry and (of the n) on return.
   void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
     for (int64_t part; n > 0; n -= part) {
       part = std::min(n, interruption::Watch::at_once(system_.a().work()));

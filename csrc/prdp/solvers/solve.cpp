@@ -9,6 +9,7 @@
 #include "prdp/solvers/solve_direct.h"
 #include "prdp/solvers/solve_on_gpu.h"
 #include "prdp/solvers/solve_samples.h"
+#include "prdp/solvers/tensor_start.h"
 #include "prdp/solvers/unnamed_null_space.h"
 #include "prdp/threads/share_samples.h"
 
@@ -41,23 +42,11 @@ SolveResult solve_samples_of(const kernels::KernelBatch<T>& kernels, const Share
   const auto& solver = request.solver;
   const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const auto caps = request.caps ? request.caps->contiguous() : at::Tensor();
-  const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
-  auto& info = result.info;
-  const SampleBatch<T> batch{.solver = solver,
-                             .max_iter = solver.max_iter.expect_int(),
-                             .unknowns = unknowns,
-                             .caps = caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
-                             .guarded = request.guarded,
-                             .b = rhs.const_data_ptr<T>(),
-                             .x0 = x0.defined() ? x0.const_data_ptr<T>() : nullptr,
-                             .u = result.u.mutable_data_ptr<T>(),
-                             .iterations = info.iterations.mutable_data_ptr<int64_t>(),
-                             .residual = info.residual.mutable_data_ptr<T>(),
-                             .status = info.status.mutable_data_ptr<int64_t>(),
-                             .applications = info.operator_applications.mutable_data_ptr<int64_t>(),
-                             .floor = info.floor.mutable_data_ptr<T>()};
+  const auto x0 = takes_start(solver.method, request.x0) ? request.x0.contiguous() : at::Tensor();
+  const SampleBatch<T> batch{solver, unknowns, arrays_of<T>(request, rhs, x0, caps, result)};
   const auto solve_range = [&](int64_t begin, int64_t end) { solve_samples(kernels, shared, batch, begin, end); };
-  share_samples(size, unknowns, grain_size(solver.method, size, unknowns, batch.max_iter, solver.restart), solve_range);
+  share_samples(size, unknowns, grain_size(solver.method, size, unknowns, batch.arrays.max_iter, solver.restart),
+                solve_range);
   return result;
 }
 

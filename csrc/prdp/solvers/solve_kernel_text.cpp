@@ -21,6 +21,34 @@ int64_t bytes_of(const ArraySizes& sizes, int64_t number) {
   return sizes.vectors * pointer + sizes.numbers * number + sizes.arrays * padding;
 }
 
+/// What the text of a kernel is made of, as setting.h names it.
+struct Sizes {
+  int64_t blocks, threads, vectors, vectors_in_block, bytes_of_arrays, restart;
+  int64_t cycle_vectors, cycle_in_block, cycle_at_most;
+};
+
+std::string text_of(const Sizes& sizes, const OperatorView& a, const Solver& solver, const at::Tensor& b) {
+  const auto& row = traits(solver.method);
+  std::ostringstream text;
+  text << "#include \"prdp/gpu/device/solve.h\"\n#include \"prdp/solvers/" << row.kernel_header << "\"\n"
+       << "using namespace prdp::gpu;\n"
+       << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", ";
+  for (const int64_t n : {sizes.blocks, sizes.threads, sizes.vectors, sizes.vectors_in_block,
+                          int64_t{solver.preconditioner.is_diagonal()}, int64_t{divides_by_diagonal(solver)},
+                          sizes.bytes_of_arrays, sizes.restart})
+    text << n << ", ";
+  if (solver.preconditioner.is_multigrid())
+    text << "CycleSetting<" << b.dim() - 2 << ", " << sizes.cycle_vectors << ", " << sizes.cycle_in_block << ", "
+         << sizes.cycle_at_most << ">";
+  else text << "NoCycleSetting";
+  text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
+       << "using Arguments = SolveArguments<S::T>;\n"
+       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const Arguments arguments) {\n"
+          "  PRDP_BLOCK_MEMORY(memory);\n"
+          "  solve_batch<Method, S>(arguments, reinterpret_cast<S::T*>(memory));\n}\n";
+  return text.str();
+}
+
 }  // namespace
 
 bool has_kernel(const Solver& solver) {
@@ -37,32 +65,24 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
   const auto& row = traits(solver.method);
   const bool is_restarted = row.counts == Counts::kCycles, by_multigrid = solver.preconditioner.is_multigrid();
   const int64_t number = b.element_size(), restart = is_restarted ? std::min(solver.restart, unknowns) : 0;
-  const int64_t of_cycles = !by_multigrid ? 0 : is_saddle_point ? 2 * kVectorsOfCycle : kVectorsOfCycle;
-  const int64_t vectors = kOwnVectors + vectors_of(solver.method, restart) + of_cycles;
+  const int64_t cycle_vectors = !by_multigrid ? 0 : is_saddle_point ? 2 * kVectorsOfCycle : kVectorsOfCycle;
+  const int64_t vectors = kOwnVectors + vectors_of(solver.method, restart) + cycle_vectors;
   const auto [blocks, threads] = team_size(unknowns, limits);
   // Coarse grids come first into the memory of the block, then the vectors of the finest one.
   const CycleMemory cycle = by_multigrid ? memory_of_cycle(b) : CycleMemory{};
   const int64_t of_block = blocks > 1 ? 0 : limits.block_memory / number;
   const int64_t cycle_in_block = cycle.if_all_axes <= of_block ? cycle.if_all_axes : 0;
   const int64_t in_block = std::min(vectors, (of_block - cycle_in_block) / unknowns);
-
-  std::ostringstream text;
-  text << "#include \"prdp/gpu/device/solve.h\"\n#include \"prdp/solvers/" << row.kernel_header << "\"\n"
-       << "using namespace prdp::gpu;\n"
-       << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", ";  // as setting.h names them
-  for (const int64_t n : {blocks, threads, vectors, in_block, int64_t{solver.preconditioner.is_diagonal()},
-                          int64_t{divides_by_diagonal(solver)}, bytes_of(row.arrays(restart), number), restart})
-    text << n << ", ";
-  if (by_multigrid)
-    text << "CycleSetting<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.at_most
-         << ">";
-  else text << "NoCycleSetting";
-  text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
-       << "using Arguments = SolveArguments<S::T>;\n"
-       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const Arguments arguments) {\n"
-          "  PRDP_BLOCK_MEMORY(memory);\n"
-          "  solve_batch<Method, S>(arguments, reinterpret_cast<S::T*>(memory));\n}\n";
-  return {{text.str(), threads, (in_block * unknowns + cycle_in_block) * number, blocks},
+  const Sizes sizes{.blocks = blocks,
+                    .threads = threads,
+                    .vectors = vectors,
+                    .vectors_in_block = in_block,
+                    .bytes_of_arrays = bytes_of(row.arrays(restart), number),
+                    .restart = restart,
+                    .cycle_vectors = cycle_vectors,
+                    .cycle_in_block = cycle_in_block,
+                    .cycle_at_most = cycle.at_most};
+  return {{text_of(sizes, a, solver, b), threads, (in_block * unknowns + cycle_in_block) * number, blocks},
           (vectors - in_block) * unknowns + numbers_beyond(restart) + cycle.at_most};
 }
 

@@ -76,21 +76,10 @@ SolveResult launch(const ReadyKernel& ready, const at::Tensor& b, const SolveReq
   arguments.a = arguments_of(a);
   arguments.null_space = arguments_of<T>(a.null_space, b, a.null_field);
   arguments.left_null_space = arguments_of<T>(a.left_null_space, b, a.null_field);
-  arguments.b = b.const_data_ptr<T>();
-  arguments.x0 = x0.defined() ? x0.const_data_ptr<T>() : nullptr;
-  arguments.u = result.u.mutable_data_ptr<T>();
-  arguments.caps = caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr;
-  arguments.iterations = result.info.iterations.mutable_data_ptr<int64_t>();
-  arguments.status = result.info.status.mutable_data_ptr<int64_t>();
-  arguments.applications = result.info.operator_applications.mutable_data_ptr<int64_t>();
-  arguments.residual = result.info.residual.mutable_data_ptr<T>();
-  arguments.floor = result.info.floor.mutable_data_ptr<T>();
+  arguments.arrays = arrays_of<T>(request, b, x0, caps, result);
   arguments.memory = memory.own<T>();
   memory.put_into(arguments);
   arguments.batch = batch;
-  arguments.max_iter = request.solver.max_iter.expect_int();
-  arguments.rtol = request.solver.rtol;
-  arguments.guarded = request.guarded;
   arguments.needs_projection = a.needs_projection;
   if (hierarchy.defined()) {
     const auto& preconditioner = request.solver.preconditioner;

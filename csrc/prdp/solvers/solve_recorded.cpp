@@ -1,3 +1,5 @@
+#include "prdp/solvers/solve_recorded.h"
+
 #include <algorithm>
 
 #include "prdp/operators/sums_in_order.h"
@@ -7,7 +9,6 @@
 #include "prdp/solvers/tensor_preconditioner.h"
 #include "prdp/solvers/tensor_space.h"
 
-/// Solves that autograd records, all iterations at once or one at a time.
 namespace prdp {
 
 namespace {

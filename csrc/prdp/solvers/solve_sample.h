@@ -4,6 +4,7 @@
 #include <limits>
 
 #include "prdp/kernels/scales.h"
+#include "prdp/solvers/batch_arrays.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/start.h"
 
@@ -26,16 +27,6 @@ bool is_settled_beforehand(T b, T start, const IsFinite& a_is_finite, const HasZ
   if (b == T(0)) return settle(SolveStatus::kConverged);
   return false;
 }
-
-template <class T>
-struct GivenSample {
-  const T *b, *x0;  // without a start, null
-  T* u;
-  T magnitude;  // of b
-  int64_t cap;
-  double rtol;
-  bool guarded;
-};
 
 /// Stores u = factor/scale x, as A' = factor A and b' = scale b; returns its largest number, which is not finite if one
 /// leaves the range of T.

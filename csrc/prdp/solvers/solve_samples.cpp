@@ -10,25 +10,8 @@ namespace {
 
 template <class T>
 void report(const SampleBatch<T>& batch, int64_t s, const SampleOutcome& outcome) {
-  if (outcome.is_zero) std::fill_n(batch.u + s * batch.unknowns, batch.unknowns, T(0));
-  batch.status[s] = static_cast<int64_t>(outcome.status);
-  batch.iterations[s] = outcome.iterations;
-  batch.residual[s] = static_cast<T>(outcome.residual);
-  batch.applications[s] = outcome.applications;
-  batch.floor[s] = static_cast<T>(outcome.floor);
-}
-
-template <class T>
-GivenSample<T> given_sample(const SampleBatch<T>& batch, int64_t s) {
-  const T* const b = batch.b + s * batch.unknowns;
-  const bool starts = batch.x0 && !traits(batch.solver.method).is_direct;
-  return {.b = b,
-          .x0 = starts ? batch.x0 + s * batch.unknowns : nullptr,
-          .u = batch.u + s * batch.unknowns,
-          .magnitude = kernels::largest_magnitude(b, batch.unknowns),
-          .cap = batch.caps ? batch.caps[s] : batch.max_iter,
-          .rtol = batch.solver.rtol,
-          .guarded = batch.guarded};
+  if (outcome.is_zero) std::fill_n(batch.arrays.u + s * batch.unknowns, batch.unknowns, T(0));
+  batch.arrays.report.write(s, outcome);
 }
 
 /// Reports on a sample that needs no iterations, or gets none; returns false for all others. Without a kernel, A is not
@@ -63,7 +46,8 @@ class OpenSamples {
     while (++index_ < end_) {
       if (!shared_) own_ = kernels_.make(index_);
       const auto* a = shared_ ? shared_->a.get() : own_.get();
-      given_ = given_sample(batch_, index_);
+      const T* const b = batch_.arrays.b + index_ * batch_.unknowns;
+      given_ = batch_.arrays.sample(index_, batch_.unknowns, kernels::largest_magnitude(b, batch_.unknowns));
       if (report_if_settled(batch_, index_, given_, a)) continue;
       if (shared_ && is_set_) return true;
       const auto& solver = batch_.solver;
@@ -111,7 +95,7 @@ void solve_samples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>
   auto& workspace = kernels::Workspace<T>::local();
   const auto method = batch.solver.method;
   const int64_t restart = std::min(batch.solver.restart, batch.unknowns);
-  const bool starts = batch.x0 != nullptr;
+  const bool starts = batch.arrays.x0 != nullptr;
   const auto& a = open.system().a();
   workspace.prepare(SampleSpace<T>::vectors(starts) + vectors_of(method, restart), a.length(), a.layout().halo);
   SampleSpace<T> space(open.system(), workspace, starts);

@@ -85,36 +85,32 @@ struct Solver {
   void check(const char* who) const;
 };
 
-struct Jacobi {
+/// A method with a limit and a tolerance.
+template <Method kMethod>
+struct PlainMethod {
   int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
-  operator Solver() const { return {Method::kJacobi, max_iter, rtol}; }
+  operator Solver() const { return {kMethod, max_iter, rtol}; }
 };
+/// One that takes a preconditioner, too.
+template <Method kMethod>
+struct PreconditionedMethod {
+  int64_t max_iter = kToBeGiven;
+  double rtol = kDefaultRtol;
+  Preconditioner preconditioner{};
+  operator Solver() const { return {kMethod, max_iter, rtol, kDefaultRestart, preconditioner}; }
+};
+
+using Jacobi = PlainMethod<Method::kJacobi>;
 /// Jacobi's iteration, accelerated with the known spectrum of A; for Heat and Poisson only (Golub and Varga 1961).
-struct Chebyshev {
-  int64_t max_iter = kToBeGiven;
-  double rtol = kDefaultRtol;
-  operator Solver() const { return {Method::kChebyshev, max_iter, rtol}; }
-};
-struct SteepestDescent {
-  int64_t max_iter = kToBeGiven;
-  double rtol = kDefaultRtol;
-  operator Solver() const { return {Method::kSteepestDescent, max_iter, rtol}; }
-};
+using Chebyshev = PlainMethod<Method::kChebyshev>;
+using SteepestDescent = PlainMethod<Method::kSteepestDescent>;
 /// For symmetric definite operators.
-struct CG {
-  int64_t max_iter = kToBeGiven;
-  double rtol = kDefaultRtol;
-  Preconditioner preconditioner{};
-  operator Solver() const { return {Method::kConjugateGradient, max_iter, rtol, kDefaultRestart, preconditioner}; }
-};
+using CG = PreconditionedMethod<Method::kConjugateGradient>;
 /// For any operator; two products with A per iteration. Preconditioned from the right.
-struct BiCGStab {
-  int64_t max_iter = kToBeGiven;
-  double rtol = kDefaultRtol;
-  Preconditioner preconditioner{};
-  operator Solver() const { return {Method::kBiCGStab, max_iter, rtol, kDefaultRestart, preconditioner}; }
-};
+using BiCGStab = PreconditionedMethod<Method::kBiCGStab>;
+/// For symmetric operators, definite or not. A preconditioner must be positive definite.
+using MINRES = PreconditionedMethod<Method::kMinres>;
 /// Restarted; max_iter counts cycles. Preconditioned from the right.
 struct GMRES {
   int64_t restart = kDefaultRestart;
@@ -122,13 +118,6 @@ struct GMRES {
   double rtol = kDefaultRtol;
   Preconditioner preconditioner{};
   operator Solver() const { return {Method::kGmres, max_iter, rtol, restart, preconditioner}; }
-};
-/// For symmetric operators, definite or not. A preconditioner must be positive definite.
-struct MINRES {
-  int64_t max_iter = kToBeGiven;
-  double rtol = kDefaultRtol;
-  Preconditioner preconditioner{};
-  operator Solver() const { return {Method::kMinres, max_iter, rtol, kDefaultRestart, preconditioner}; }
 };
 /// V-cycles, u ← u + M⁻¹(b - A u); max_iter counts them. For the operators that Preconditioner::multigrid() is for.
 struct Multigrid {

@@ -13,6 +13,7 @@ namespace prdp {
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
 
 TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0) {
+  // The direction z: x0, scaled, without its part in the null space. It takes a product unless that leaves nothing.
   const auto of_order_one = [](const at::Tensor& v) { return scale_finite_samples(v, largest_magnitude(v)); };
   const auto y = of_order_one(x0.detach()).v;
   auto takes_product = per_sample(y.flatten(1).ne(0).any(1), b);
@@ -22,10 +23,12 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
         only_rounding_is_left(dot_in_order(z, z), dot_in_order(y, y), epsilon_of(b)).logical_not());
     z = at::where(takes_product, z, at::zeros_like(z));
   }
+  // x = α z with the least residual r.
   const auto [product, scale] = of_order_one(a.project(a.apply(z)));
   const auto product2 = dot_in_order(product, product);
   const auto alpha = dot_in_order(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
   const auto x = z * scale * alpha, r = b - alpha * product;
+  // It is taken where it is better than zero, by more than the rounding of its product where A may be singular.
   const auto b2 = dot_in_order(b, b), left2 = dot_in_order(r, r);
   auto better = left2.lt(b2).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
   if (a.may_be_singular()) {

@@ -1,7 +1,7 @@
 #pragma once
 #include <string>
 
-#include "prdp/solvers/solve.h"
+#include "prdp/solvers/report_failures.h"
 
 /// Whether A and a preconditioner of one's own are what a method is made for, as a few products tell.
 namespace prdp {

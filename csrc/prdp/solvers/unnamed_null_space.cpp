@@ -24,6 +24,8 @@ at::Tensor constant_shares(const at::Tensor& v) {
   return at::where(part <= subnormal_rounding(scale, v), 0.0, part / whole);
 }
 
+/// Of a solve: with fewer than few, rounding has hardly grown along a null space; beside many, the products that tell
+/// of one cost little.
 constexpr int64_t kFewProducts = 32, kManyProducts = 256;
 
 /// Whether rounding may grow in few products.
@@ -93,7 +95,8 @@ void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
   suspects = suspects & (of_b > 64.0 * epsilon_of(b)) & (residual >= 0.5 * of_b);
   if (none()) return;
   if (!traits(request.solver.method).is_direct) {
-    // The products that tell it are dear beside few others, so there u has to look like no truncated solution.
+    // The products that tell it are dear beside few others. There, u must look as if it had grown along a constant, or
+    // the solve must have gone wrong.
     suspects = suspects & ((info.operator_applications >= kManyProducts) |
                            info.status.eq(static_cast<int64_t>(SolveStatus::kStagnated)) | (residual > 1.0) |
                            shares(result.u).le(0.9).logical_not());

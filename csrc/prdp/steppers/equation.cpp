@@ -6,6 +6,7 @@
 #include <algorithm>
 
 #include "prdp/autograd/detach_failed.h"
+#include "prdp/autograd/op_results.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/memory_check.h"

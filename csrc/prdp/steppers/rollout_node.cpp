@@ -3,6 +3,7 @@
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/custom_class.h>
 
+#include "prdp/autograd/for_each_cotangent.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/registered_products.h"

@@ -1,5 +1,5 @@
 #pragma once
-#include "prdp/autograd/packed_options.h"
+#include "prdp/autograd/op_results.h"
 #include "prdp/steppers/rollout_vjp.h"
 
 /// The ops prdp::rollout_solves and prdp::rollout_vjp. A rollout is a row of solves, picard_steps to a step: solve s

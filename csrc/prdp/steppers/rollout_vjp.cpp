@@ -4,7 +4,7 @@
 
 #include <utility>
 
-#include "prdp/autograd/packed_options.h"
+#include "prdp/autograd/op_results.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"

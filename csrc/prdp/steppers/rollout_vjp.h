@@ -5,6 +5,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/linear_solve.h"
+#include "prdp/solvers/warnings.h"
 #include "prdp/steppers/equation.h"
 #include "prdp/threads/interruption.h"
 

@@ -1,6 +1,8 @@
 #pragma once
 #include <cstdint>
 
+#include "prdp/solvers/batch_arrays.h"
+
 /// What a kernel is called with. The host and the kernel read the same text.
 namespace prdp::gpu {
 
@@ -80,18 +82,11 @@ template <class T>
 struct SolveArguments {
   OperatorArguments a;
   NullSpaceArguments<T> null_space, left_null_space;
-  const T *b, *x0;      // (batch, unknowns); no start: null
-  T* u;                 // (batch, unknowns)
-  const int64_t* caps;  // (batch,); null: all have max_iter
-  // The report, (batch,) each.
-  int64_t *iterations, *status, *applications;
-  T *residual, *floor;
+  BatchArrays<T> arrays;
   T* memory;            // vectors that do not fit into a block, and what damping needs, for each team
   unsigned* arrived;    // of each team
   double* parts;        // of the sums of each team
-  int64_t batch, max_iter;
-  double rtol;
-  int64_t guarded;
+  int64_t batch;
   int64_t needs_projection;  // products leave the range of A by their rounding, and are projected
   HierarchyView<T> hierarchy;
 };

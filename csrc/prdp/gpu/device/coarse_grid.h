@@ -101,4 +101,21 @@ struct CoarsenedAxis {
   }
 };
 
+/// Coarse point i along an axis, and the fine points around it.
+struct CoarsePoint {
+  int inner, j, outer;  // its place in the axes after this one, along it, and in those before
+  int fine[3];          // before it, where it lies, and after it
+  int before, after;    // the points between coarse ones on its two sides, -1 beyond the grid
+
+  CoarsePoint(const CoarsenedAxis& line, int i)
+      : inner(i % line.inner),
+        j(i / line.inner % line.coarse),
+        outer(i / line.inner / line.coarse),
+        before(line.before(j)),
+        after(line.after(j)) {
+    for (int p = 0; p < 3; ++p)
+      fine[p] = line.entry_of(outer, (line.of_coarse(j) + p - 1 + line.n) % line.n, line.n, inner);
+  }
+};
+
 }  // namespace prdp::gpu

@@ -16,14 +16,8 @@ Method make_method(Space& space) {
 template <class Method, class S, class Space>
 SampleOutcome solve_sample_of(const SolveArguments<typename S::T>& of, int64_t sample, Space& space) {
   using T = typename S::T;
-  const int64_t begin = sample * Space::unknowns();
-  GivenSample<T> given{.b = of.b + begin,
-                       .x0 = of.x0 ? of.x0 + begin : nullptr,
-                       .u = of.u + begin,
-                       .magnitude = space.largest_given(of.b + begin),
-                       .cap = of.caps ? of.caps[sample] : of.max_iter,
-                       .rtol = of.rtol,
-                       .guarded = of.guarded != 0};
+  const T magnitude = space.largest_given(of.arrays.b + sample * Space::unknowns());
+  const GivenSample<T> given = of.arrays.sample(sample, Space::unknowns(), magnitude);
   const T start = given.x0 ? space.largest_given(given.x0) : T(0);
   const auto divides_by_zero = [&] {
     if constexpr (S::kDividesByDiagonal) return space.has_zero_diagonal();
@@ -45,13 +39,8 @@ void solve_batch(const SolveArguments<typename S::T>& of, typename S::T* in_bloc
   for_samples_of_team<S::kBlocks, S::kThreads>(of, of.batch, [&](int64_t sample, auto& team, int number) {
     Space space(team, typename S::A(of.a, sample), of, sample, in_block, of.memory + Space::kNumbersBeyond * number);
     const SampleOutcome outcome = solve_sample_of<Method, S>(of, sample, space);
-    if (outcome.is_zero) space.fill_zero(of.u + sample * Space::unknowns());
-    if (!team.leads()) return;
-    of.iterations[sample] = outcome.iterations;
-    of.status[sample] = static_cast<int64_t>(outcome.status);
-    of.applications[sample] = outcome.applications;
-    of.residual[sample] = static_cast<T>(outcome.residual);
-    of.floor[sample] = static_cast<T>(outcome.floor);
+    if (outcome.is_zero) space.fill_zero(of.arrays.u + sample * Space::unknowns());
+    if (team.leads()) of.arrays.report.write(sample, outcome);
   });
 }
 

@@ -1,6 +1,5 @@
 #include "prdp/steppers/flow/diffusion.h"
 
-#include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/steppers/flow/kernels.h"
 #include "prdp/steppers/flow/stencil_of.h"
@@ -21,12 +20,6 @@ std::vector<OperatorSpec> diffusion_operators(const FlowEquation& e, const at::T
     operators.push_back(stencil_of(*e.box, coefficients));
   }
   return operators;
-}
-
-OperatorSpec stencil_of(const FlowBox& box, const at::Tensor& coefficients) {
-  std::vector<bool> periodic;
-  for (int64_t axis = 0; axis < box.dim(); ++axis) periodic.push_back(box.boundary(axis) == FlowBoundary::kPeriodic);
-  return nearest_stencil(coefficients, box.shape(), periodic);
 }
 
 FlowParts diffuse(const FlowEquation& equation, const std::vector<OperatorSpec>& operators, const at::Tensor& change,

@@ -56,22 +56,25 @@ void for_each_term(const FlowEquation& e, const GhostedGrid& grid, double nu, co
     }
 }
 
-/// Adds the cotangents of a row of c and w from those of what a point reads.
+/// The rows of `bars` as advect_row_back() fills them, a value for each point of a row of the grid.
+enum Bars { kBefore, kHere, kAfter, kLow, kHigh, kDiffusion, kBars };
+
+/// Adds the cotangents of a row of c and w from those of what its points read.
 template <class T>
-void add_back(const AdvectionTerm<T>& t, const T* bars, T* c_bar, T* w_bar, int64_t n) {
-  const auto add = [&](int k, T* to) { kernels::loops<T>().axpy(T(1), bars + k * n, to, n); };
-  add(0, c_bar - t.step);
-  add(1, c_bar);
-  add(2, c_bar + t.step);
+void add_row_back(const AdvectionTerm<T>& t, const T* bars, T* c_bar, T* w_bar, int64_t n) {
+  const auto add = [&](Bars k, T* to) { kernels::loops<T>().axpy(T(1), bars + k * n, to, n); };
+  add(kBefore, c_bar - t.step);
+  add(kHere, c_bar);
+  add(kAfter, c_bar + t.step);
   T* const edge = t.own ? c_bar : w_bar;
-  add(3, t.own ? edge - t.step : edge - t.own_step);
-  add(3, edge);
-  add(4, t.own ? edge : edge + t.step - t.own_step);
-  add(4, edge + t.step);
+  add(kLow, t.own ? edge - t.step : edge - t.own_step);
+  add(kLow, edge);
+  add(kHigh, t.own ? edge : edge + t.step - t.own_step);
+  add(kHigh, edge + t.step);
 }
 
 template <class T>
-void run(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& out) {
+void advect(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& out) {
   const GhostedGrid grid(*e.box);
   const int64_t d = e.box->dim(), cells = grid.cells();
   const double nu = e.nu.item<double>();
@@ -90,7 +93,7 @@ void run(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& out)
 }
 
 template <class T>
-double run_back(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& g, const at::Tensor& bar) {
+double advect_back(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& g, const at::Tensor& bar) {
   const GhostedGrid grid(*e.box);
   const int64_t d = e.box->dim(), cells = grid.cells(), n = grid.n[2];
   const double nu = e.nu.item<double>();
@@ -100,16 +103,16 @@ double run_back(const FlowEquation& e, const at::Tensor& padded, const at::Tenso
   for_each_sample(g, [&](int64_t s) {
     const T *p = values + s * d * grid.field, *given = cotangents + s * d * cells;
     T* b = result + s * d * grid.field;
-    std::vector<T> bars(6 * n);
+    std::vector<T> bars(kBars * n);
     for_each_term<T>(e, grid, nu, [&](int64_t c, int64_t w, const AdvectionTerm<T>& term, double per_nu) {
-      std::fill_n(bars.data() + 5 * n, n, T(0));
+      std::fill_n(bars.data() + kDiffusion * n, n, T(0));
       grid.for_each_row([&](int64_t at, int64_t from) {
         kernels::loops<T>().advect_row_back(term, p + c * grid.field + at, p + w * grid.field + at,
                                             given + c * cells + from, bars.data(), n);
-        add_back(term, bars.data(), b + c * grid.field + at, b + w * grid.field + at, n);
+        add_row_back(term, bars.data(), b + c * grid.field + at, b + w * grid.field + at, n);
       });
       double sum = 0;
-      for (int64_t i = 0; i < n; ++i) sum += static_cast<double>(bars[5 * n + i]);
+      for (int64_t i = 0; i < n; ++i) sum += static_cast<double>(bars[kDiffusion * n + i]);
       nu_bars[s] += sum * per_nu;
     });
   });
@@ -119,7 +122,7 @@ double run_back(const FlowEquation& e, const at::Tensor& padded, const at::Tenso
 }
 
 template <class T>
-void run_courant(const FlowEquation& e, const T* u, int64_t cells, T* out) {
+void find_courant_number(const FlowEquation& e, const T* u, int64_t cells, T* out) {
   constexpr int64_t block = 1024;
   std::array<T, block> sums;
   T largest = 0;
@@ -146,15 +149,15 @@ at::Tensor advect_and_diffuse(const FlowEquation& equation, const at::Tensor& pa
   auto sizes = padded.sizes().vec();
   for (int64_t axis = 0; axis < equation.box->dim(); ++axis) sizes[axis + 2] = equation.box->shape()[axis];
   const auto out = at::zeros(sizes, padded.options());
-  padded.scalar_type() == at::kFloat ? run<float>(equation, padded, out) : run<double>(equation, padded, out);
+  padded.scalar_type() == at::kFloat ? advect<float>(equation, padded, out) : advect<double>(equation, padded, out);
   return out;
 }
 
 ExplicitVjp advect_and_diffuse_vjp(const FlowEquation& equation, const at::Tensor& padded,
                                    const at::Tensor& cotangent) {
   const auto g = cotangent.contiguous(), bar = at::zeros_like(padded);
-  const double nu = padded.scalar_type() == at::kFloat ? run_back<float>(equation, padded, g, bar)
-                                                       : run_back<double>(equation, padded, g, bar);
+  const double nu = padded.scalar_type() == at::kFloat ? advect_back<float>(equation, padded, g, bar)
+                                                       : advect_back<double>(equation, padded, g, bar);
   return {bar, at::full({}, nu, padded.options())};
 }
 
@@ -164,7 +167,7 @@ at::Tensor courant_numbers_by_loops(const FlowEquation& equation, const at::Tens
     const auto* values = given.const_data_ptr<scalar_t>();
     auto* found = out.mutable_data_ptr<scalar_t>();
     const int64_t cells = GhostedGrid(*equation.box).cells(), d = equation.box->dim();
-    for_each_sample(u, [&](int64_t s) { run_courant(equation, values + s * d * cells, cells, found + s); });
+    for_each_sample(u, [&](int64_t s) { find_courant_number(equation, values + s * d * cells, cells, found + s); });
   });
   return out;
 }

@@ -29,13 +29,14 @@ Beginning begin_step(const FlowEquation& e, const at::Tensor& u, bool host_looks
 }
 
 ExplicitPart explicit_part(const FlowEquation& e, const Beginning& beginning) {
-  if (!beginning.of_kernels) return explicit_part_of(e, beginning.velocity, beginning.refused.mask);
+  if (!beginning.of_kernels) return explicit_part_without_kernels(e, beginning.velocity, beginning.refused.mask);
   const auto change = flow_kernels::change(e, *beginning.of_kernels);
   if (change.defined()) return {beginning.velocity, change};
-  return explicit_part_of(e, beginning.velocity, beginning.of_kernels->status.ne(0));
+  return explicit_part_without_kernels(e, beginning.velocity, beginning.of_kernels->status.ne(0));
 }
 
-ExplicitPart explicit_part_of(const FlowEquation& e, const at::Tensor& with_boundary, const at::Tensor& refused) {
+ExplicitPart explicit_part_without_kernels(const FlowEquation& e, const at::Tensor& with_boundary,
+                                           const at::Tensor& refused) {
   const auto velocity = cleared(with_boundary, refused);
   const auto change = cleared(tendency(without_boundary_of(e, refused), velocity), refused);
   // Where autograd may record, a tensor stays as it is.

@@ -30,6 +30,7 @@ struct ExplicitPart {
 };
 ExplicitPart explicit_part(const FlowEquation& e, const Beginning& beginning);
 /// The same by tensor operations or loops, from u with its boundary values and the samples that are refused.
-ExplicitPart explicit_part_of(const FlowEquation& e, const at::Tensor& with_boundary, const at::Tensor& refused);
+ExplicitPart explicit_part_without_kernels(const FlowEquation& e, const at::Tensor& with_boundary,
+                                           const at::Tensor& refused);
 
 }  // namespace prdp

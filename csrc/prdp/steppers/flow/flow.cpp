@@ -1,7 +1,7 @@
 #include "prdp/steppers/flow/flow.h"
 
 #include "prdp/steppers/flow/projection.h"
-#include "prdp/steppers/flow/step_node.h"
+#include "prdp/steppers/flow/rollout.h"
 #include "prdp/steppers/flow/tendency.h"
 
 namespace prdp {

@@ -5,8 +5,8 @@
 #include <cmath>
 
 #include "prdp/operators/operator.h"
-#include "prdp/solvers/raise_or_warn.h"
 #include "prdp/solvers/status.h"
+#include "prdp/solvers/warnings.h"
 #include "prdp/steppers/flow/tendency.h"
 
 namespace prdp {

@@ -5,12 +5,11 @@
 #include <torch/custom_class.h>
 
 #include "prdp/autograd/adjoint_log.h"
-#include "prdp/autograd/detach_failed.h"
+#include "prdp/autograd/for_each_cotangent.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/rollout_vjp.h"
 #include "prdp/threads/interruption.h"
 
@@ -21,13 +20,11 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
-enum class Output { kNext, kNextAndPressure, kStates };
-
 /// What travels from the forward to the backward pass beside tensors.
 struct Call : torch::CustomClassHolder {
   FlowEquation equation;
   int64_t steps;
-  Output output;
+  FlowOutput output;
   SolveOptions options;
   std::shared_ptr<const RegisteredProducts> products;  // of the preconditioner
 };
@@ -45,14 +42,12 @@ std::vector<at::Tensor> or_undefined(at::TensorList given) {
   return tensors;
 }
 
-at::Tensor with_pressure(const FlowStep& step, double dt) { return at::cat({step.u, step.potential / dt}, 1); }
-
 /// What is asked for, and the reports of the steps.
-SolveResult forward_steps(const FlowEquation& equation, const at::Tensor& u, int64_t steps, Output output,
+SolveResult forward_steps(const FlowEquation& equation, const at::Tensor& u, int64_t steps, FlowOutput output,
                           const SolveOptions& options) {
-  if (output != Output::kStates) {
-    auto step = flow_step(equation, u, options);
-    return {output == Output::kNext ? step.u : with_pressure(step, equation.dt), step.info};
+  if (output != FlowOutput::kStates) {
+    const auto step = flow_step(equation, u, options);
+    return {output_of(step, output, equation.dt), step.info};
   }
   auto sizes = u.sizes().vec();
   sizes.insert(sizes.begin() + 1, steps + 1);
@@ -82,7 +77,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     ctx->mark_non_differentiable({info.iterations, info.residual, info.status, info.operator_applications, info.floor});
     ctx->set_materialize_grads(false);
     const bool may_have_failed = call->options.on_failure != OnFailure::kRaise;
-    variable_list saved{call->output == Output::kStates ? out : u, may_have_failed ? info.status : at::Tensor()};
+    variable_list saved{call->output == FlowOutput::kStates ? out : u, may_have_failed ? info.status : at::Tensor()};
     saved.insert(saved.end(), tensors.begin(), tensors.end());
     ctx->save_for_backward(std::move(saved));
     ctx->saved_data["call"] = c10::IValue::make_capsule(call);
@@ -99,8 +94,8 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     std::vector<int64_t> needed(tensors.size() + 1);
     for (size_t i = 0; i < needed.size(); ++i) needed[i] = ctx->needs_input_grad(i);
     const auto of_cotangent = [&](const at::Tensor& cotangent) {
-      return call->output == Output::kStates ? states_vjp(equation, saved[0], saved[1], cotangent, *call, needed)
-                                             : step_vjp(equation, saved[0], saved[1], cotangent, *call, needed);
+      return call->output == FlowOutput::kStates ? states_vjp(equation, saved[0], saved[1], cotangent, *call, needed)
+                                                 : step_vjp(equation, saved[0], saved[1], cotangent, *call, needed);
     };
     const WithoutAutocast full_precision;
     const auto found = for_each_cotangent(grads[0], of_cotangent);
@@ -113,7 +108,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
                                           const at::Tensor& cotangent, const Call& call, at::IntArrayRef needed) {
     SolveInfo info;
     FlowCotangent of_step{without_lost_of(cotangent, status, call)};
-    if (call.output == Output::kNextAndPressure) {
+    if (call.output == FlowOutput::kNextAndPressure) {
       const int64_t d = u.size(1);
       of_step = {of_step.u.narrow(1, 0, d), of_step.u.narrow(1, d, 1) / equation.dt};
     }
@@ -149,7 +144,13 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   }
 };
 
-SolveResult apply_node(const FlowEquation& equation, const at::Tensor& u, int64_t steps, Output output,
+}  // namespace
+
+at::Tensor output_of(const FlowStep& step, FlowOutput output, double dt) {
+  return output == FlowOutput::kNext ? step.u : at::cat({step.u, step.potential / dt}, 1);
+}
+
+SolveResult flow_steps(const FlowEquation& equation, const at::Tensor& u, int64_t steps, FlowOutput output,
                        const SolveOptions& options) {
   options.check("Flow");
   equation.check(u);
@@ -170,59 +171,6 @@ SolveResult apply_node(const FlowEquation& equation, const at::Tensor& u, int64_
   call->products = products_of(options.solver.preconditioner.spec());
   const auto out = FlowSteps::apply(u, at::TensorList(tensors), call);
   return {out[0], {out[1], out[2], out[3], out[4], out[5]}};
-}
-
-/// A step whose solves have nodes of their own.
-SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options,
-                          Output output = Output::kNext) {
-  const auto step = flow_step(equation, u, options);
-  const auto out = output == Output::kNext ? step.u : with_pressure(step, equation.dt);
-  return {options.on_failure == OnFailure::kZeroGrad ? detach_failed(out, step.info.status) : out, step.info};
-}
-
-SolveResult one_step(const FlowEquation& equation, const at::Tensor& u, Output output, const SolveOptions& options) {
-  if (options.backward != Backward::kUnrolled) return apply_node(equation, u, 1, output, options);
-  options.check("Flow");
-  equation.check(u);
-  return unrolled_step(equation, u, options, output);
-}
-
-/// Whether the implicit diffusion takes the forces with their pressure, and commutes with the projection after it.
-bool is_diffused_with_pressure(const FlowEquation& e) {
-  return e.is_diffused_implicitly() && !e.box->fields(e.nu.options()).free.defined();
-}
-
-SolveResult unrolled_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
-                             const SolveOptions& options) {
-  options.check("Flow");
-  equation.check(u);
-  return solve_by_solve(u, steps, 1,
-                        [&](const at::Tensor& state, int64_t) { return unrolled_step(equation, state, options); });
-}
-
-}  // namespace
-
-SolveResult flow_next(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
-  return one_step(equation, u, Output::kNext, options);
-}
-
-SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
-  auto found = one_step(equation, u, Output::kNextAndPressure, options);
-  if (!is_diffused_with_pressure(equation)) return found;
-  const int64_t d = equation.box->dim();
-  const auto p = found.u.narrow(1, d, 1);  // φ/Δt of the projection; the pressure is (I - ν Δt L) φ/Δt
-  const auto diffusion = make_operator(diffusion_operators(equation.for_state(u), p).front());  // the same for all
-  found.u = at::cat({found.u.narrow(1, 0, d), diffusion->apply(p)}, 1);
-  return found;
-}
-
-SolveResult flow_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
-                         const SolveOptions& options) {
-  TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
-  if (options.backward == Backward::kUnrolled) return unrolled_rollout(equation, u, steps, options);
-  auto found = apply_node(equation, u, steps, Output::kStates, options);
-  if (options.backward == Backward::kNone) found.u = from_state(u, found.u);
-  return found;
 }
 
 }  // namespace prdp

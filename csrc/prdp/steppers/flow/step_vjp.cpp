@@ -146,7 +146,7 @@ std::vector<at::Tensor> explicit_vjp_by_autograd(const FlowEquation& equation, c
   for (size_t i = 0; i < given.size(); ++i)
     inputs.push_back(given[i].defined() ? given[i].detach().requires_grad_(needed[i + 1]) : given[i]);
   const auto e = equation.with_tensors(at::TensorList(inputs).slice(1)).for_state(u);
-  const auto part = explicit_part_of(e, with_boundary_values(e, inputs[0]), refused);
+  const auto part = explicit_part_without_kernels(e, with_boundary_values(e, inputs[0]), refused);
   return gradients({part.velocity, part.change, e.nu}, {velocity_bar, joined(bar.change), bar.nu}, inputs, needed,
                    /*create_graph=*/false);
 }

@@ -1,0 +1,91 @@
+#include <ATen/core/grad_mode.h>
+
+#include "prdp/error_text.h"
+#include "prdp/kernels/kernel.h"
+#include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/probes.h"
+#include "prdp/operators/remembered.h"
+#include "prdp/operators/singular_operator.h"
+#include "prdp/operators/tensors.h"
+
+/// What is refused of the null spaces that somebody named.
+namespace prdp {
+
+void SingularOperator::check_vector(const at::Tensor& b) const {
+  a_->check_vector(b);
+  for (const auto* side : {&right_, &left_}) {
+    if (side->is_constant()) continue;
+    const auto& basis = side->given;
+    const auto vector = b.sym_sizes().slice(1), channel = b.sym_sizes().slice(b.dim() < 3 ? 1 : 2);
+    const auto given = basis.sym_sizes().slice(basis.dim() > 0);
+    TORCH_CHECK_VALUE(
+        basis.dim() >= 2 && (given == channel || given == vector), title_,
+        ": a null space must have shape (k, *shape) with the shape of a channel, ", channel,
+        b.dim() < 3 ? "" : ", or (k, channels, *shape)", ", got ", basis.sym_sizes(),
+        basis.sym_sizes() == channel || basis.sym_sizes() == vector ? "; give n.unsqueeze(0) for one vector n" : "");
+    TORCH_CHECK_VALUE(basis.device() == b.device(), title_, ": its null space is on ", basis.device(),
+                      " but the vector is on ", b.device());
+  }
+  TORCH_CHECK_VALUE(right_.spans_channels(b) == left_.spans_channels(b), title_,
+                    ": nullspace and left_nullspace must both be of one channel, or both of all channels");
+}
+
+namespace {
+
+/// ‖A‖∞ of each sample or of all, by the CPU loops where there are some.
+at::Tensor norm_of(const Operator& a, const at::Tensor& b) {
+  const auto kernels = b.is_cpu() ? a.kernels(b, /*transposed=*/false) : nullptr;
+  if (!kernels) return a.norm().to(b.device(), at::kDouble);
+  return std::visit(
+      [&](const auto& batch) {
+        std::vector<double> norms;
+        for (int64_t s = 0; s < (batch.is_shared ? 1 : b.size(0)); ++s) {
+          const auto kernel = batch.make(s);
+          norms.push_back(kernel ? kernel->norm() / static_cast<double>(kernel->factor())
+                                 : std::numeric_limits<double>::infinity());
+        }
+        return at::tensor(norms, at::kDouble);
+      },
+      kernels->of_dtype);
+}
+
+/// How large an entry of a product with numbers up to one can be, of each sample or of all: ‖A‖∞ or, of a Function,
+/// whose norm is not known, what the product with signs without a pattern has.
+at::Tensor size_of_products(const Operator& a, const at::Tensor& b) {
+  const auto norm = norm_of(a, b);
+  if (!norm.eq(0).all().item<bool>()) return norm;
+  return sample_maxima(apply_on_loops(a, unstructured_like(b).sign().contiguous(), /*transposed=*/false));
+}
+
+}  // namespace
+
+void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, const at::Tensor& size,
+                                               bool transposed) const {
+  const auto q = orthonormal(basis, b);
+  const double rounding = 200.0 * epsilon_of(b);
+  for (int64_t k = 0; k < q.size(0); ++k) {
+    const auto v = (q[k] / q[k].abs().amax()).expand_as(by_vector(b, basis.spans_channels(b))).reshape_as(b);
+    const auto left = sample_maxima(apply_on_loops(*a_, v, transposed));
+    const auto wrong = (left > rounding * size).logical_and(left.isfinite());  // what is not finite, its status says
+    TORCH_CHECK_VALUE(
+        !wrong.any().item<bool>(), title_, ": vector ", k, " of ",
+        in_language(transposed ? "left_nullspace" : "nullspace", transposed ? "the left ones" : "those"),
+        " is not in the null space of ", transposed ? "Aᵀ" : "A", ": a product has entries of ",
+        left.masked_fill(wrong.logical_not(), 0.0).amax().item<double>(), " where ‖v‖∞ is 1",
+        transposed ? c10::str("; give ", in_language("left_nullspace=", "the left one, too,"), " if A is not symmetric")
+                   : std::string());
+  }
+}
+
+void SingularOperator::check_null_spaces(const at::Tensor& b) const {
+  static thread_local SpecFingerprint checked;
+  if (b.numel() == 0 || checked.matches(spec_, b.scalar_type())) return;
+  const at::NoGradGuard no_grad;
+  a_->check_parameters(Checks::kShared);  // the products here are no kernel's
+  const auto size = size_of_products(*a_, b);
+  check_is_mapped_to_zero(right_, b, size, /*transposed=*/false);
+  check_is_mapped_to_zero(left_, b, size, /*transposed=*/true);
+  checked.store(spec_, b.scalar_type());
+}
+
+}  // namespace prdp
