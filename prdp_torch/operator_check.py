@@ -114,10 +114,23 @@ def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
             yield str(error).removeprefix(f"{type(A).__name__}: ")
         return
     # Beside each row's own size: a row of one holds the constant, whatever stands in the others.
-    constant, sizes = A.apply(torch.ones_like(v)).abs(), A.apply(v).abs()
-    shares = torch.where(sizes > 0, constant / sizes, constant.ne(0).to(v.dtype))
-    if (shares.flatten(1).square().mean(1).sqrt() <= 1e3 * torch.finfo(v.dtype).eps).any():
-        yield "A maps the constant to zero, so it is singular: give nullspace='constant'"
+    sizes = A.apply(v).abs()
+
+    def is_mapped_to_zero(constant: Tensor) -> bool:
+        product = A.apply(constant).abs()
+        shares = torch.where(sizes > 0, product / sizes, product.ne(0).to(v.dtype))
+        return bool((shares.flatten(1).square().mean(1).sqrt() <= 1e3 * torch.finfo(v.dtype).eps).any())
+
+    ones = torch.ones_like(v)
+    if not is_mapped_to_zero(ones):
+        return
+    shape = tuple(v.shape[1:])
+    if len(shape) > 1 and shape[0] > 1:  # another constant in each channel
+        unlike = torch.linspace(1, 2, shape[0], dtype=v.dtype, device=v.device).view(-1, *[1] * (len(shape) - 1))
+        if not is_mapped_to_zero(ones * unlike):
+            yield f"A maps the constant of all channels to zero, so it is singular: give nullspace=torch.ones{(1, *shape)}"
+            return
+    yield "A maps the constant to zero, so it is singular: give nullspace='constant'"
 
 
 def _captures(A: Operator, v: Tensor) -> Iterator[str]:

@@ -70,6 +70,23 @@ def test_a_product_that_mixes_samples_is_refused():
         prdp.linear_solve(operators.Function(lambda v: 3 * v + v.sum(0)), b, prdp.GMRES(9))
 
 
+@pytest.mark.parametrize("share", [1e-5, 0.05, 0.5])
+def test_samples_that_mix_a_little_are_refused_too(share):
+    b = torch.randn(16, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=r"of sample \d+ depends on the v of sample \d+"):
+        prdp.linear_solve(operators.Function(lambda v: 2 * v - share * v.mean(0, keepdim=True)), b, prdp.GMRES(9))
+
+
+def test_samples_that_a_weight_mixes_later_are_refused_then():
+    def solve(weight):
+        a = operators.Function(lambda v, w: 2 * v + w * v.roll(1, 0), tensors=(torch.tensor(weight).double(),))
+        return prdp.linear_solve(a, right_hand_side(), prdp.GMRES(9))
+
+    solve(0.0)
+    with pytest.raises(ValueError, match="must keep samples apart"):
+        solve(0.3)
+
+
 def test_the_step_of_a_product_by_differences_may_be_that_of_the_batch():
     n, dtype = 32, torch.float32
     u = torch.sin(torch.linspace(0, 3, n, dtype=dtype)).repeat(4, 1) * torch.tensor([[1.0], [2.0], [0.5], [1.5]])

@@ -146,3 +146,40 @@ def test_other_shapes_are_refused():
     mixed = operators.Function(saddle, tensors=(WEIGHT,), nullspace=PRESSURE, left_nullspace="constant")
     with pytest.raises(ValueError, match="Function: nullspace and left_nullspace must both be of one channel, or both"):
         prdp.linear_solve(mixed, b, SOLVERS["gmres"])
+
+
+def exchange(coupling):
+    """Two temperatures that exchange heat: only the constant of both together is mapped to zero."""
+
+    def product(v):
+        e = coupling * (v[:, 0] - v[:, 1])
+        return 2 * v - v.roll(1, -1) - v.roll(-1, -1) + torch.stack([e, -e], 1)
+
+    return product
+
+
+def test_a_null_vector_of_all_channels_is_no_constant_of_each():
+    n = 8
+    g = torch.Generator().manual_seed(0)
+    product = exchange(torch.rand(n, dtype=torch.float64, generator=g) + 0.5)
+    b = torch.randn(1, 2, n, dtype=torch.float64, generator=g)
+    b -= b.mean()
+    solver = prdp.CG(60, rtol=1e-10)
+
+    def function(nullspace=None):
+        return prdp.operators.Function(product, symmetric=True, nullspace=nullspace)
+
+    with pytest.raises(torch.linalg.LinAlgError, match=r"all channels together .*nullspace=torch.ones\(1, 2, 8\)"):
+        prdp.linear_solve(function(), b + 1, solver)
+    with pytest.raises(ValueError, match=r"nullspace=torch.ones\(1, 2, 8\)"):
+        prdp.check_operator(function(), b)
+    with pytest.raises(ValueError, match=r"in each channel alone: one of all channels has shape \(1, channels"):
+        prdp.linear_solve(function("constant"), b, solver)
+    named = function(torch.ones(1, 2, n, dtype=torch.float64))
+    assert prdp.check_operator(named, b)
+    u, info = prdp.linear_solve(named, b, solver)
+    assert info.solved.all() and (product(u) - b).norm() < 1e-9 * b.norm()
+    # Of each channel, the name is that of before.
+    apart = prdp.operators.Function(exchange(0.0), symmetric=True)
+    with pytest.raises(ValueError, match="nullspace='constant'"):
+        prdp.check_operator(apart, b)

@@ -1,4 +1,5 @@
 #pragma once
+#include <algorithm>
 #include <cmath>
 #include <numeric>
 #include <vector>
@@ -24,19 +25,21 @@ class NullSpace {
       for (int64_t f = 0; f < span; ++f)
         loops<T>().copy_rows(T(1), v.data() + f * points, layout.nx, basis_.back().data() + f * layout.plane,
                              layout.row, layout.rows, layout.nx);
+      support_.push_back(support_of(basis_.back()));
     }
   }
   /// Takes off the part of v in the null space, but for parts along one of its vectors that are no larger than
   /// `negligible`; returns the norm of what it takes off.
   T project(T* v, T negligible = 0) const {
     double part2 = 0;
-    const int64_t length = span_ * layout_.plane;
     for (int64_t f = first_; f < first_ + fields_; f += span_)
-      for (const auto& q : basis_) {
-        T* field = v + f * layout_.plane;
-        const T along = vectors_.dot(q.data(), field, length);
+      for (size_t k = 0; k < basis_.size(); ++k) {
+        const auto [begin, length] = support_[k];
+        const T* q = basis_[k].data() + begin;
+        T* field = v + f * layout_.plane + begin;
+        const T along = vectors_.dot(q, field, length);
         if (std::abs(along) <= negligible) continue;
-        vectors_.axpy(-along, q.data(), field, length);
+        vectors_.axpy(-along, q, field, length);
         part2 += static_cast<double>(along) * static_cast<double>(along);
       }
     return static_cast<T>(std::sqrt(part2));
@@ -59,6 +62,19 @@ class NullSpace {
   int64_t count_in_one_field() const { return span_ == 1 ? std::ssize(basis_) : std::ssize(in_one_field()); }
 
  private:
+  /// From the first entry to the last one that is not zero, in whole registers.
+  struct Support {
+    int64_t begin, length;
+  };
+  static Support support_of(const std::vector<T>& q) {
+    constexpr int64_t whole = 16;
+    const auto is_there = [](T x) { return x != T(0); };
+    const auto end = static_cast<int64_t>(q.rend() - std::find_if(q.rbegin(), q.rend(), is_there));
+    const auto first = static_cast<int64_t>(std::find_if(q.begin(), q.end(), is_there) - q.begin());
+    const int64_t begin = std::min(first, end) / whole * whole;
+    return {begin, std::min((end + whole - 1) / whole * whole, std::ssize(q)) - begin};
+  }
+
   /// Makes v orthonormal to the others; false if it depends on them.
   static bool is_new(const std::vector<std::vector<double>>& others, std::vector<double>& v) {
     const auto dot = [](const auto& a, const auto& b) {
@@ -78,6 +94,7 @@ class NullSpace {
   Layout<T> layout_;
   int64_t first_, fields_, span_;
   std::vector<std::vector<T>> basis_;
+  std::vector<Support> support_;
   WholeVectors<T> vectors_;
 };
 

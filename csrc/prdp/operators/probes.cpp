@@ -11,6 +11,17 @@ at::Tensor unstructured_like(const at::Tensor& like) {
   return numbers.square().sin().to(like.scalar_type()).view_as(like[0]).expand_as(like);
 }
 
+at::Tensor unlike_numbers(int64_t count, const at::TensorOptions& options) {
+  constexpr double golden_ratio = 0.6180339887498949;
+  const auto numbers = at::arange(count, options.dtype(at::kDouble));
+  return ((1.0 - 0.5 * (golden_ratio * numbers).frac()) * (1.0 - 2.0 * numbers.remainder(2))).to(options);
+}
+
+at::Tensor in_each_channel(const at::Tensor& vector, const at::Tensor& like) {
+  const int64_t channels = like.dim() > 2 ? like.size(1) : 1;
+  return (unlike_numbers(channels, vector.options()).unsqueeze(1) * vector).expand_as(like);
+}
+
 at::Tensor estimated_norm(const Operator& a, const at::Tensor& like) {
   const at::NoGradGuard no_grad;
   const auto norm_of = [](const at::Tensor& v) { return v.flatten(1).norm(2, 1); };

@@ -20,10 +20,11 @@ namespace {
 /// Orthonormal vectors in double by Gram and Schmidt, twice.
 at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
   std::vector<at::Tensor> done;
+  const bool are_apart = rows.ne(0).sum(0).le(1).all().item<bool>();  // such as those of the parts of a graph
   for (int64_t k = 0; k < rows.size(0); ++k) {
     auto q = rows[k];
     const auto whole = q.norm();
-    for (int pass = 0; pass < 2; ++pass)
+    for (int pass = 0; pass < 2 && !are_apart; ++pass)
       for (const auto& other : done) q = q - other.dot(q) * other;
     const auto left = q.norm();
     constexpr double independent = 1e-6;

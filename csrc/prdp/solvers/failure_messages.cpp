@@ -44,10 +44,25 @@ bool is_finite(const Operator& a, const at::Tensor& b, int64_t sample) {
 /// Whether the null space of A is known: somebody named it, or it is that of a pressure.
 bool knows_null_space(const SolveRole& role) { return is_singular(role.a) || operator_kind(role.a.kind).has_pressure; }
 
-/// Whether A maps the constant to zero, though nobody named its null space. Operators of the library know their own.
-bool has_undeclared_constant_null_space(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  return a.may_be_singular() && !knows_null_space(role) &&
-         maps_constant_to_zero(a, b, /*transposed=*/false)[sample].item<bool>();
+/// How to name the constant of each channel.
+std::string name_the_null_space() {
+  return std::string("give ") + in_language("nullspace=\"constant\" to the operator", "prdp::with_null_space(a)") +
+         ", or all vectors if it maps more to zero";
+}
+
+/// Where A maps a constant to zero, though nobody named its null space: that, in words. Else empty. Operators of the
+/// library know their own.
+std::string undeclared_null_space(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (!a.may_be_singular() || knows_null_space(role)) return {};
+  const auto maps_to_zero = [&](bool jointly) {
+    return maps_constant_to_zero(a, b, /*transposed=*/false, jointly)[sample].item<bool>();
+  };
+  if (maps_to_zero(/*jointly=*/false))
+    return "A maps the constant to zero, so it is singular; " + name_the_null_space();
+  if (b.dim() < 3 || b.size(1) == 1 || !maps_to_zero(/*jointly=*/true)) return {};
+  return c10::str("A maps the constant of all channels together to zero, so it is singular; give it as a vector, ",
+                  in_language("nullspace=torch.ones", "prdp::with_null_space(a, at::ones"), "(1, ",
+                  c10::Join(", ", b.sizes().slice(1)), ")", in_language("", ")"), " in the dtype of b");
 }
 
 /// Where the rows of A, or its columns, differ so much in size that the dtype loses the small ones beside the large
@@ -221,11 +236,6 @@ std::string zero_diagonal(const SolveRole& role, const Operator& a, const at::Te
                     : "; take GMRES");
 }
 
-std::string name_the_null_space() {
-  return std::string("give ") + in_language("nullspace=\"constant\" to the operator", "prdp::with_null_space(a)") +
-         ", or all vectors if it maps more to zero";
-}
-
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (!knows_null_space(role))
     return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which " +
@@ -253,9 +263,8 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
                       int64_t sample) {
   const at::NoGradGuard no_grad;
   const auto why = [&]() -> std::string {
-    if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
-        has_undeclared_constant_null_space(role, a, b, sample))
-      return "A maps the constant to zero, so it is singular; " + name_the_null_space();
+    if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown)
+      if (auto unnamed = undeclared_null_space(role, a, b, sample); !unnamed.empty()) return unnamed;
     if (status == SolveStatus::kBreakdown)
       if (auto lost = lost_in_factors(role, a, b, sample); !lost.empty()) return lost;
     if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown || status == SolveStatus::kStagnated)
