@@ -126,9 +126,10 @@ def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
         return
     shape = tuple(v.shape[1:])
     if len(shape) > 1 and shape[0] > 1:  # another constant in each channel
-        unlike = torch.linspace(1, 2, shape[0], dtype=v.dtype, device=v.device).view(-1, *[1] * (len(shape) - 1))
+        unlike = torch.linspace(1, 2, shape[0]).to(v).view(-1, *[1] * (len(shape) - 1))
         if not is_mapped_to_zero(ones * unlike):
-            yield f"A maps the constant of all channels to zero, so it is singular: give nullspace=torch.ones{(1, *shape)}"
+            vector = f"torch.ones{(1, *shape)}"
+            yield f"A maps the constant of all channels to zero, so it is singular: give nullspace={vector}"
             return
     yield "A maps the constant to zero, so it is singular: give nullspace='constant'"
 

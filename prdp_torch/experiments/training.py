@@ -141,6 +141,10 @@ def train(
     """
     if data_parallel.count() > 1 and not scene.trains_network:
         raise ValueError(f"train: several processes share the batches of a network; the task '{scene.task}' has none")
+    if not isinstance(refinement, Refinement):
+        raise TypeError(f"train: refinement must be a Refinement, such as Refinement.auto(), got {refinement!r}")
+    if scene.training.intervals < 1:
+        raise ValueError(f"train: scene.training.intervals must be >= 1, got {scene.training.intervals}")
     scene = placed(scene, device)
     if not isinstance(callbacks, Iterable):
         raise TypeError(f"train: callbacks must be a list of functions, got {callbacks!r}")

@@ -78,7 +78,8 @@ class Operator:
                 t.register_hook(functools.partial(_refuse_freed, f"{type(self).__name__}: {name}", weakref.ref(t)))
 
     def apply(self, v: Tensor) -> Tensor:
-        """Return A v, with gradients. v has the shape of a right-hand side."""
+        """Return A v, with gradients. v has the shape of a right-hand side. With a null space that is named, the product
+        is without its part outside the range of A, which a named null space defines: a wrong one changes it."""
         product: Tensor = torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
         return product
 
@@ -94,7 +95,8 @@ class Operator:
 
     def dense(self, dtype: torch.dtype = torch.float64) -> Tensor:
         """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples, in float64 unless `dtype` says
-        otherwise. Only for small n: ValueError if it would not fit into the memory of the machine."""
+        otherwise; with a null space that is named, the matrix of `apply`. Only for small n: ValueError if it would not
+        fit into the memory of the machine."""
         self._check_dense_fits(dtype)
         matrix: Tensor = torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
         return matrix

@@ -184,3 +184,23 @@ def test_a_matrix_without_rows_is_refused(matrix):
 def test_an_empty_batch_is_solved():
     u, info = prdp.linear_solve(torch.eye(3).to_sparse_csr(), torch.zeros(0, 3), prdp.Direct())
     assert u.shape == (0, 3) and statuses(info) == []
+
+
+def test_a_row_of_thousands_of_entries_is_summed_to_the_dtype():
+    """A star: in float32, one sum after another lost a hundred times the tolerance, and the status did not see it."""
+    n = 10_000
+    g = torch.Generator().manual_seed(0)
+    weights = 0.5 * torch.rand(n - 1, generator=g) / n
+    crow = torch.cat([torch.tensor([0, n]), torch.arange(n + 1, 2 * n)])
+    columns = torch.cat([torch.arange(n), torch.arange(1, n)])
+    values = torch.cat([torch.ones(1), weights, torch.ones(n - 1)])
+    a = prdp.operators.Matrix.csr(crow, columns, values, (n, n))
+    b = torch.rand(n, generator=g)
+    exact = b.double().clone()
+    exact[0] -= weights.double() @ exact[1:]
+    for solver in (prdp.GMRES(4, rtol=2e-7), prdp.BiCGStab(9, rtol=2e-7), prdp.Jacobi(9, rtol=2e-7)):
+        u, info = prdp.linear_solve(a, b, solver)
+        residual = u.double().clone()
+        residual[0] += weights.double() @ residual[1:]
+        assert info.solved.all() and (residual - b).norm() < 4e-7 * b.norm()
+        assert abs(u[0].double() - exact[0]) < 1e-6

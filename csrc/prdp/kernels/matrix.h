@@ -128,9 +128,9 @@ class Csr final : public MatrixKernel<T> {
   void apply(const T* v, T* out) const override {
     this->for_each_part(work(), 1, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) {
-        T sum = 0;
-        for (int64_t k = crow_[i]; k < crow_[i + 1]; ++k) sum += values_[k] * v[col_[k]];
-        out[i] = sum;
+        double sum = 0;  // a row may have thousands of entries
+        for (int64_t k = crow_[i]; k < crow_[i + 1]; ++k) sum += static_cast<double>(values_[k]) * v[col_[k]];
+        out[i] = static_cast<T>(sum);
       }
     });
   }
