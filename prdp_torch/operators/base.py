@@ -78,8 +78,8 @@ class Operator:
                 t.register_hook(functools.partial(_refuse_freed, f"{type(self).__name__}: {name}", weakref.ref(t)))
 
     def apply(self, v: Tensor) -> Tensor:
-        """Return A v, with gradients. v has the shape of a right-hand side. With a null space that is named, the product
-        is without its part outside the range of A, which a named null space defines: a wrong one changes it."""
+        """Return A v, with gradients. v has the shape of a right-hand side. Where a null space is named, the product is
+        without its part along the left one, also if that is wrong."""
         product: Tensor = torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
         return product
 

@@ -190,7 +190,7 @@ def test_a_row_of_thousands_of_entries_is_summed_to_the_dtype():
     """A star: in float32, one sum after another lost a hundred times the tolerance, and the status did not see it."""
     n = 10_000
     g = torch.Generator().manual_seed(0)
-    weights = 0.5 * torch.rand(n - 1, generator=g) / n
+    weights = torch.rand(n - 1, generator=g)
     crow = torch.cat([torch.tensor([0, n]), torch.arange(n + 1, 2 * n)])
     columns = torch.cat([torch.arange(n), torch.arange(1, n)])
     values = torch.cat([torch.ones(1), weights, torch.ones(n - 1)])
@@ -198,9 +198,9 @@ def test_a_row_of_thousands_of_entries_is_summed_to_the_dtype():
     b = torch.rand(n, generator=g)
     exact = b.double().clone()
     exact[0] -= weights.double() @ exact[1:]
-    for solver in (prdp.GMRES(4, rtol=2e-7), prdp.BiCGStab(9, rtol=2e-7), prdp.Jacobi(9, rtol=2e-7)):
+    for solver in (prdp.GMRES(4, rtol=1e-5), prdp.BiCGStab(9, rtol=1e-5), prdp.Jacobi(9, rtol=1e-5)):
         u, info = prdp.linear_solve(a, b, solver)
         residual = u.double().clone()
         residual[0] += weights.double() @ residual[1:]
-        assert info.solved.all() and (residual - b).norm() < 4e-7 * b.norm()
-        assert abs(u[0].double() - exact[0]) < 1e-6
+        assert info.solved.all() and (residual - b).norm() < 5e-6 * b.norm()
+        assert abs(u[0].double() - exact[0]) < 1e-3  # of some 2,500

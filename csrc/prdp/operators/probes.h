@@ -10,8 +10,8 @@ at::Tensor unstructured_like(const at::Tensor& like);
 /// Numbers from ½ to 1 with either sign, of which no two have the same size; the first is 1.
 at::Tensor unlike_numbers(int64_t count, const at::TensorOptions& options);
 
-/// A vector (n,) in each channel of `like`, (batch, n) or (batch, channels, n), times such numbers: a product with it is
-/// zero only if that with the vector in one channel alone is.
+/// A vector (n,) in each channel of `like`, (batch, n) or (batch, channels, n), times such numbers: a product with it
+/// is zero only if that with the vector in one channel alone is.
 at::Tensor in_each_channel(const at::Tensor& vector, const at::Tensor& like);
 
 /// About ‖A‖ of each sample, from below: the largest growth of such a vector in a few products.

@@ -190,8 +190,10 @@ void read_training(Section& s, Scene& scene) {
            "in place of `decay`: the learning rate falls to a tenth over this many updates, along a cosine", "updates",
            adam});
   const When exponential = adam && When{!t.cosine_updates, "not with `cosine_updates`"};
-  s.above(t.decay, 0.0,
-          {"decay", "factor of the learning rate over `decay_steps` updates, applied smoothly; or give `cosine_updates`", "", exponential});
+  s.above(
+      t.decay, 0.0,
+      {"decay", "factor of the learning rate over `decay_steps` updates, applied smoothly; or give `cosine_updates`",
+       "", exponential});
   s.whole(t.decay_steps, 1, {"decay_steps", "see `decay`", "updates", exponential});
   s.choice(t.loss, {"nmse", "mse"},
            {"loss", "mean of ‖u - u_ref‖²/‖u_ref‖² over the samples, or mean squared error", "", network(scene)});
