@@ -169,7 +169,9 @@ def test_a_null_vector_of_all_channels_is_no_constant_of_each():
     def function(nullspace=None):
         return prdp.operators.Function(product, symmetric=True, nullspace=nullspace)
 
-    with pytest.raises(torch.linalg.LinAlgError, match=r"all channels together .*nullspace=torch.ones\(1, 2, 8\)"):
+    with pytest.raises(
+        torch.linalg.LinAlgError, match=r"of all channels together as a vector, nullspace=torch.ones\(1, 2, 8\)"
+    ):
         prdp.linear_solve(function(), b + 1, solver)
     with pytest.raises(ValueError, match=r"nullspace=torch.ones\(1, 2, 8\)"):
         prdp.check_operator(function(), b)
@@ -179,7 +181,41 @@ def test_a_null_vector_of_all_channels_is_no_constant_of_each():
     assert prdp.check_operator(named, b)
     u, info = prdp.linear_solve(named, b, solver)
     assert info.solved.all() and (product(u) - b).norm() < 1e-9 * b.norm()
+    for solver in (prdp.GMRES(100, rtol=1e-10), prdp.BiCGStab(300, rtol=1e-10)):
+        with pytest.raises(torch.linalg.LinAlgError, match=r"nullspace=torch.ones\(1, 2, 8\)"):
+            prdp.linear_solve(function(), b + 1, solver)
     # Of each channel, the name is that of before.
     apart = prdp.operators.Function(exchange(0.0), symmetric=True)
     with pytest.raises(ValueError, match="nullspace='constant'"):
         prdp.check_operator(apart, b)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("channels, nodes", [(2, 3000), (3, 20000)])
+def test_the_rounding_of_a_hub_is_not_held_against_the_constant(channels, nodes, dtype):
+    leaf, hub = torch.arange(1, nodes), torch.zeros(nodes - 1, dtype=torch.long)
+    degree = torch.ones(nodes, dtype=dtype)
+    degree[0] = nodes - 1
+
+    def laplacian(v):
+        along = torch.zeros_like(v).index_add(-1, hub, v[..., leaf]).index_add(-1, leaf, v[..., hub])
+        return degree * v - along
+
+    b = torch.randn(1, channels, nodes, dtype=dtype, generator=torch.Generator().manual_seed(0))
+    b -= b.mean(-1, keepdim=True)
+    a = operators.Function(laplacian, symmetric=True, nullspace="constant")
+    _, info = prdp.linear_solve(a, b, prdp.CG(50, rtol=1e-4))
+    assert info.solved.all()
+
+
+@pytest.mark.parametrize("weight", [1e-6, 1e-8])
+def test_a_small_cotangent_beside_the_sum_of_another_channel_is_kept(weight):
+    n = 64
+    b = torch.randn(1, 2, n, generator=torch.Generator().manual_seed(0))
+    b = (b - b.mean(-1, keepdim=True)).requires_grad_()
+    wave = torch.sin(torch.arange(n) * 1.0)
+    a = operators.Diffusion(torch.ones(1, n), boundary="flux", length=float(n))
+    u, _ = prdp.linear_solve(a, b, prdp.CG(200, rtol=1e-6))
+    (both,) = torch.autograd.grad(u[:, 0].sum() + weight * (u[:, 1] * wave).sum(), b, retain_graph=True)
+    (alone,) = torch.autograd.grad((u[:, 1] * wave).sum(), b)
+    torch.testing.assert_close(both[0, 1], weight * alone[0, 1], rtol=1e-3, atol=1e-9 * weight)

@@ -1,4 +1,5 @@
 #pragma once
+#include <ATen/ATen.h>
 #include <ATen/LegacyVmapTransforms.h>
 
 #include <vector>

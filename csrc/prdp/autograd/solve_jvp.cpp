@@ -9,8 +9,8 @@ namespace prdp {
 at::Tensor reachable_part(const Operator& a, const at::Tensor& v) {
   const auto part = a.project(a.project(v));
   if (!a.needs_projection()) return part;
-  const double rounding = 16.0 * epsilon_of(v);  // all that is left of the cotangent of a sum, say
-  return cleared(part, sample_maxima(part.detach()) <= rounding * sample_maxima(v.detach()));
+  const double rounding = 4.0 * epsilon_of(v);  // of every entry: all that is left of the cotangent of a sum, say
+  return cleared(part, (part.detach().abs() <= rounding * v.detach().abs()).flatten(1).all(1));
 }
 
 namespace {

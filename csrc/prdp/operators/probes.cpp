@@ -14,7 +14,8 @@ at::Tensor unstructured_like(const at::Tensor& like) {
 at::Tensor unlike_numbers(int64_t count, const at::TensorOptions& options) {
   constexpr double golden_ratio = 0.6180339887498949;
   const auto numbers = at::arange(count, options.dtype(at::kDouble));
-  return ((1.0 - 0.5 * (golden_ratio * numbers).frac()) * (1.0 - 2.0 * numbers.remainder(2))).to(options);
+  const auto signs = at::where((golden_ratio * numbers).frac() < 0.5, 1.0, -1.0);
+  return (at::exp2(-numbers.remainder(8)) * signs).to(options);
 }
 
 at::Tensor in_each_channel(const at::Tensor& vector, const at::Tensor& like) {

@@ -7,7 +7,7 @@ namespace prdp {
 /// A vector of no structure, the same for each sample of `like`.
 at::Tensor unstructured_like(const at::Tensor& like);
 
-/// Numbers from ½ to 1 with either sign, of which no two have the same size; the first is 1.
+/// Powers of two with either sign, down to 2⁻⁷, so that a product with them rounds as one with 1; the first is 1.
 at::Tensor unlike_numbers(int64_t count, const at::TensorOptions& options);
 
 /// A vector (n,) in each channel of `like`, (batch, n) or (batch, channels, n), times such numbers: a product with it

@@ -44,25 +44,23 @@ bool is_finite(const Operator& a, const at::Tensor& b, int64_t sample) {
 /// Whether the null space of A is known: somebody named it, or it is that of a pressure.
 bool knows_null_space(const SolveRole& role) { return is_singular(role.a) || operator_kind(role.a.kind).has_pressure; }
 
-/// How to name the constant of each channel.
-std::string name_the_null_space() {
-  return std::string("give ") + in_language("nullspace=\"constant\" to the operator", "prdp::with_null_space(a)") +
-         ", or all vectors if it maps more to zero";
-}
-
-/// Where A maps a constant to zero, though nobody named its null space: that, in words. Else empty. Operators of the
-/// library know their own.
-std::string undeclared_null_space(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (!a.may_be_singular() || knows_null_space(role)) return {};
-  const auto maps_to_zero = [&](bool jointly) {
-    return maps_constant_to_zero(a, b, /*transposed=*/false, jointly)[sample].item<bool>();
-  };
-  if (maps_to_zero(/*jointly=*/false))
-    return "A maps the constant to zero, so it is singular; " + name_the_null_space();
-  if (b.dim() < 3 || b.size(1) == 1 || !maps_to_zero(/*jointly=*/true)) return {};
-  return c10::str("A maps the constant of all channels together to zero, so it is singular; give it as a vector, ",
+/// How to name the constant that A, or Aᵀ if `transposed`, maps to zero: that of each channel, or of all together.
+std::string name_the_null_space(const Operator& a, const at::Tensor& b, int64_t sample, bool transposed) {
+  if (b.dim() < 3 || b.size(1) == 1 || maps_constant_to_zero(a, b, transposed)[sample].item<bool>())
+    return std::string("give ") + in_language("nullspace=\"constant\" to the operator", "prdp::with_null_space(a)") +
+           ", or all vectors if it maps more to zero";
+  return c10::str("give that of all channels together as a vector, ",
                   in_language("nullspace=torch.ones", "prdp::with_null_space(a, at::ones"), "(1, ",
                   c10::Join(", ", b.sizes().slice(1)), ")", in_language("", ")"), " in the dtype of b");
+}
+
+/// Where A maps the constant to zero, though nobody named its null space: that, in words. Else empty. Operators of the
+/// library know their own.
+std::string undeclared_null_space(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const bool is_there = a.may_be_singular() && !knows_null_space(role) &&
+                        maps_constant_to_zero(a, b, /*transposed=*/false, /*jointly=*/true)[sample].item<bool>();
+  if (!is_there) return {};
+  return "A maps the constant to zero, so it is singular; " + name_the_null_space(a, b, sample, /*transposed=*/false);
 }
 
 /// Where the rows of A, or its columns, differ so much in size that the dtype loses the small ones beside the large
@@ -240,7 +238,8 @@ std::string inconsistent(const SolveRole& role, const Operator& a, const at::Ten
   if (!knows_null_space(role))
     return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which " +
            (role.adjoint ? "Aᵀ" : "A") + " cannot reach, as " + (role.adjoint ? "A" : "Aᵀ") +
-           " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") + name_the_null_space();
+           " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") +
+           name_the_null_space(a, b, sample, /*transposed=*/true);
   const auto outside = (b - a.project(b)).select(0, sample);
   const auto share = three_digits(100.0 * norm_of(outside) / norm_of(b.select(0, sample))) + " % of ";
   if (!operator_kind(role.a.kind).has_pressure) {

@@ -106,7 +106,8 @@ void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
                            shares(result.u).le(0.9).logical_not());
     if (none()) return;
   }
-  const auto found = suspects & maps_constant_to_zero(a, b, /*transposed=*/true).to(suspects.device());
+  const auto found =
+      suspects & maps_constant_to_zero(a, b, /*transposed=*/true, /*jointly=*/true).to(suspects.device());
   info.status = info.status.masked_fill(found, static_cast<int64_t>(SolveStatus::kInconsistent));
   info.floor = floor_of(info.floor, info.status);
 }
