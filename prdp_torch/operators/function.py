@@ -25,7 +25,8 @@ class Function(Operator):
 
     Args:
         matvec: `matvec(v, *tensors)` returns A v as a new tensor with the shape and dtype of v. It is made of torch
-            operations and linear in v; constants belong to b. Samples may differ only through `tensors`.
+            operations, which may differentiate (a product with a Hessian or a Jacobian), and linear in v; constants
+            belong to b. Samples may differ only through `tensors`.
         transpose: the same for Aᵀ v. None takes torch's own derivative of matvec.
         tensors: what A is made of, a tuple of tensors or a single one. They get gradients. A tensor that requires
             grad and reaches matvec in another way is refused.
@@ -37,9 +38,9 @@ class Function(Operator):
             axes, they have that of b without its batch axis.
 
     `Direct` multiplies A with unit vectors, so it is for small systems. Call `prdp.check_operator` once to compare
-    the functions with each other. On the CPU, the first solve refuses a product that is far from linear or mixes
-    samples, and the backward pass warns where ⟨λ, A u⟩ and ⟨Aᵀ λ, u⟩ differ. A `Function` cannot be created inside
-    `torch.compile`.
+    the functions with each other. On the CPU, the first solve refuses a product that is far from linear, the 1st, 2nd,
+    4th, 8th, … one that mixes samples, and the backward pass warns where ⟨λ, A u⟩ and ⟨Aᵀ λ, u⟩ differ. Create a
+    `Function` outside `torch.compile`: inside, it breaks the graph.
     """
 
     kind = "function"
