@@ -77,8 +77,7 @@ at::Tensor row_sizes(const Operator& a, const at::Tensor& b, bool transposed) {
 at::Tensor maps_constant_to_zero(const Operator& a, const at::Tensor& b, bool transposed, bool jointly) {
   const auto sizes = row_sizes(a, b, transposed), channels = by_channel(b);
   const auto ones =
-      jointly ? at::ones_like(b)
-              : in_each_channel(at::ones_like(channels[0].view({-1, channels.size(-1)})[0]), channels).reshape_as(b);
+      jointly ? at::ones_like(b) : in_each_channel(at::ones({channels.size(-1)}, b.options()), channels).reshape_as(b);
   const auto constant = apply_on_loops(a, ones, transposed).to(at::kDouble);
   const auto share = at::where(sizes.gt(0), constant.abs() / sizes, constant.ne(0).to(at::kDouble));
   return share.flatten(1).square().mean(1).sqrt() <= 32.0 * epsilon_of(b);

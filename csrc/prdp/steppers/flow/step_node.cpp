@@ -49,21 +49,10 @@ SolveResult forward_steps(const FlowEquation& equation, const at::Tensor& u, int
     const auto step = flow_step(equation, u, options);
     return {output_of(step, output, equation.dt), step.info};
   }
-  auto sizes = u.sizes().vec();
-  sizes.insert(sizes.begin() + 1, steps + 1);
-  auto states = at::empty(sizes, u.options());
-  states.select(1, 0).copy_(u);
-  std::vector<SolveInfo> infos;
-  auto state = u;
-  for (int64_t s = 0; s < steps; ++s) {
-    const FailuresOfStep here(s + 1, steps);
-    interruption::Watch::local().spend(u.numel());
+  return solve_in_place(u, steps, 1, [&](const at::Tensor& state, int64_t) -> SolveResult {
     auto step = flow_step(equation, state, options);
-    state = step.u;
-    states.select(1, s + 1).copy_(state);
-    infos.push_back(std::move(step.info));
-  }
-  return {states, side_by_side(std::move(infos), u)};
+    return {std::move(step.u), std::move(step.info)};
+  });
 }
 
 class FlowSteps : public torch::autograd::Function<FlowSteps> {
