@@ -68,6 +68,13 @@ OPERATORS = {
         length=(1.0, 2.0, 0.5),
         faces="arithmetic",
     ),
+    "per axis": lambda dtype: operators.Diffusion(
+        noise(3, 2, *SHAPE, seed=2, dtype=dtype).exp(),
+        shift=20.0,
+        boundary=("periodic", ("zero", ("robin", 3.0))),
+        length=(1.0, 2.0),
+        per_axis=True,
+    ),
     "closed": lambda dtype: operators.Diffusion(noise(1, 8, seed=2, dtype=dtype).exp(), boundary="flux"),
     "stencil": lambda dtype: operators.Stencil(coefficients(dtype), OFFSETS, ("zero", "periodic")),
     "far stencil": lambda dtype: operators.Stencil(far_stencil().to(dtype), FAR, "zero"),
@@ -81,7 +88,7 @@ OPERATORS = {
     "singular": lambda dtype: nearly_singular().to(dtype),
     "matrices": lambda dtype: 9 * torch.eye(9, dtype=dtype) + noise(3, 9, 9, dtype=dtype),
 }  # fmt: skip
-SYMMETRIC = ["heat 1D", "heat 2D", "poisson 3D", "diffusion", "robin"]
+SYMMETRIC = ["heat 1D", "heat 2D", "poisson 3D", "diffusion", "robin", "per axis"]
 ANY = prdp.Jacobi, prdp.BiCGStab, prdp.GMRES
 
 

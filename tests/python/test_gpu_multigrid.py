@@ -49,6 +49,10 @@ OPERATORS = {  # with the shape of a sample
         lambda t: operators.Diffusion(jumps(4, 5, 7, dtype=t), shift=0.1, boundary=("flux", "periodic", "zero")),
         (1, 4, 5, 7),
     ),
+    "per axis": (
+        lambda t: operators.Diffusion(jumps(2, 12, 9, dtype=t), 0.1, boundary=("flux", "zero"), per_axis=True),
+        (1, 12, 9),
+    ),
     "thin": (lambda t: operators.Diffusion(torch.ones(1, 3, 14, dtype=t), length=(0.01, 1.0), shift=1.0), (2, 3, 14)),
     "flat": (
         lambda t: operators.Diffusion(torch.ones(1, 3, 14, dtype=t), length=(0.01, 1.0), shift=1.0, boundary="flux"),
@@ -85,6 +89,7 @@ CASES = [  # each operator, method and dtype
     ("poisson 3D", prdp.CG, F64),
     ("jumps", prdp.MINRES, F64),
     ("jumps 3D", prdp.Multigrid, F32),
+    ("per axis", prdp.CG, F64),
     ("thin", prdp.CG, F32),
     ("flat", prdp.CG, F64),
     ("winds", prdp.GMRES, F64),

@@ -27,15 +27,21 @@ def with_shift(make, fields, channels):
     return lambda kappa, shift: make(kappa, shift), [*fields, 20 + noise(1, *SHAPE)], channels
 
 
-def robin(rows, sides, shape=SHAPE):
-    """Of κ, a shift, and h of four sides: a number, or a field of all or of each."""
+def per_axis(rows, *shape, **settings):
+    fields = [noise(rows, len(shape), *shape, seed=2).exp(), 20 + noise(rows, *shape)]
+    return lambda kappa, shift: operators.Diffusion(kappa, shift, per_axis=True, **settings), fields, 2
+
+
+def robin(rows, sides, axes=(), shape=SHAPE):
+    """Of κ, which may have axes, a shift, and h of four sides: a number, or a field of all or of each."""
 
     def make(kappa, shift, *h):
         low, high, left, right = (("robin", of) for of in h)
-        return operators.Diffusion(kappa, shift, boundary=((low, high), (left, right)), length=(1.0, 2.0))
+        sides = ((low, high), (left, right))
+        return operators.Diffusion(kappa, shift, boundary=sides, length=(1.0, 2.0), per_axis=bool(axes))
 
     h = [noise(*sides[k], seed=5 + k).exp() if sides[k] else torch.tensor(1.3, dtype=F64) for k in range(4)]
-    return make, [noise(rows, *shape, seed=2).exp(), torch.tensor(9.0, dtype=F64), *h], 2
+    return make, [noise(rows, *axes, *shape, seed=2).exp(), torch.tensor(9.0, dtype=F64), *h], 2
 
 
 def csr(matrices):
@@ -62,6 +68,11 @@ CASES = {
     "diffusion, a number": (operators.Diffusion, [LONG, torch.tensor(1e6, dtype=F64)], 1),
     "diffusion, h of each": robin(3, [(3, SHAPE[1]), (1, SHAPE[1]), (), (3, SHAPE[0])]),
     "diffusion of all, h of each": robin(1, [(3, SHAPE[1]), (), (1, SHAPE[0]), (3, SHAPE[0])]),
+    "diffusion per axis 1D": per_axis(3, 11, boundary="zero"),
+    "diffusion per axis": per_axis(3, *SHAPE, boundary=("flux", "periodic"), length=(1.0, 2.0)),
+    "diffusion of all per axis": per_axis(1, *SHAPE, boundary=("zero", "flux"), faces="arithmetic"),
+    "diffusion per axis 3D": per_axis(3, 3, 4, 5, boundary=("periodic", ("zero", "flux"), "zero")),
+    "diffusion per axis, h of each": robin(3, [(3, SHAPE[1]), (1, SHAPE[1]), (), (3, SHAPE[0])], axes=(2,)),
     "heat": (lambda nu: operators.Heat(SHAPE, nu, 1.0), [NU], 1),
     "long heat": (lambda nu: operators.Heat((700,), nu, 1e-4), [NU], 1),
     "poisson-like heat 3D": (lambda nu: operators.Heat((3, 4, 5), nu, 1.0, length=(1.0, 2.0, 0.5)), [NU], 1),
@@ -114,7 +125,15 @@ def test_they_are_those_of_the_cpu_in_one_launch(name):
         torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-9)
 
 
-IN_ORDER = "a stencil of all", "diffusion of all", "burgers", "diffusion of all, h of each", "long heat", "sparse"
+IN_ORDER = [
+    "a stencil of all",
+    "diffusion of all",
+    "diffusion of all per axis",
+    "burgers",
+    "diffusion of all, h of each",
+    "long heat",
+    "sparse",
+]
 
 
 @pytest.mark.parametrize("name", IN_ORDER)

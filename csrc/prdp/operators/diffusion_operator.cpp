@@ -196,7 +196,6 @@ std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Ten
 }
 
 std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b, bool /*transposed*/) const {
-  if (per_axis_) return StencilOperator(as_stencil()).gpu_view(b, /*transposed=*/false);
   static_assert(static_cast<int>(Side::kZero) == 0 && static_cast<int>(Side::kPeriodic) == 2 &&
                 static_cast<int>(Side::kRobin) == 3);
   std::string sides;
@@ -211,7 +210,7 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
   };
   view.tensors[kKappa] = kappa_.contiguous();
   auto field = kappa_.sizes().vec();
-  field[0] = 1;
+  field[0] = field[1] = 1;
   take(shift_, field, kShift, kShiftNumber);
   for (size_t axis = 0; axis < 3; ++axis) {
     const int64_t d = static_cast<int64_t>(axis) - 3 + dim();
@@ -225,7 +224,8 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
     view.numbers[kInverseWidth + axis] = d < 0 ? 0.0 : inverse_width(d);
   }
   view.type = "Diffusion<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(shape_) + ", " +
-              std::to_string(b.size(1)) + ", " + std::to_string(mean_ == FaceMean::kHarmonic) + sides + ">";
+              std::to_string(b.size(1)) + ", " + std::to_string(mean_ == FaceMean::kHarmonic) + ", " +
+              std::to_string(kappa_.size(1)) + sides + ">";
   return view;
 }
 

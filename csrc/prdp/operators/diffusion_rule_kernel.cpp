@@ -34,6 +34,7 @@ std::vector<at::Tensor> DiffusionOperator::launch_product_rule(const at::Tensor&
   gpu::DiffusionProductRule<T> rule{};
   rule.pair = pair_of<T>(l, v, kappa.size(0));
   rule.batch = static_cast<int>(l.size(0));
+  rule.kappas = static_cast<int>(kappa.size(1));
   rule.harmonic = mean_ == FaceMean::kHarmonic;
   rule.kappa = kappa.const_data_ptr<T>();
   rule.kappa_out = kappa_bar.mutable_data_ptr<T>();
@@ -64,7 +65,8 @@ std::vector<at::Tensor> DiffusionOperator::launch_product_rule(const at::Tensor&
                        count))
     return {};
   const auto of_shift = sums.result(shift_sum);
-  std::vector<at::Tensor> found{kappa_bar.squeeze(1), shift_.dim() == 0 ? of_shift : of_shift.squeeze(1)};
+  std::vector<at::Tensor> found{per_axis_ ? kappa_bar : kappa_bar.squeeze(1),
+                                shift_.dim() == 0 ? of_shift : of_shift.squeeze(1)};
   for (const auto& side : robin_sides) {
     const auto bar = sums.result(side.sum);
     found.push_back(bar.dim() == 0 ? bar : bar.squeeze(2 + side.axis).squeeze(1));
@@ -73,7 +75,7 @@ std::vector<at::Tensor> DiffusionOperator::launch_product_rule(const at::Tensor&
 }
 
 std::vector<at::Tensor> DiffusionOperator::product_rule_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (per_axis_ || !has_product_rule_kernel(lambda, u)) return {};
+  if (!has_product_rule_kernel(lambda, u)) return {};
   return u.scalar_type() == at::kFloat ? launch_product_rule<float>(lambda, u) : launch_product_rule<double>(lambda, u);
 }
 

@@ -8,9 +8,10 @@ namespace prdp::gpu {
 inline constexpr int kZeroSide = 0, kPeriodicSide = 2, kRobinSide = 3;
 
 /// The same for each channel. The sides are those of z, y and x, the low one first. Numbers: the shift; 1/h along z, y
-/// and x; h of each side where that is a number. Tensors, where they are there: κ, the shift, h of each side.
-template <class T, class G, int kChannels, bool kHarmonic, int... kSides>
-class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, T> {
+/// and x; h of each side where that is a number. Tensors, where they are there: κ, one for all axes or one for each of
+/// the last kKappas axes, the shift, h of each side.
+template <class T, class G, int kChannels, bool kHarmonic, int kKappas, int... kSides>
+class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKappas, kSides...>, T> {
  public:
   static constexpr int kUnknowns = kChannels * G::kPoints;
 
@@ -38,7 +39,8 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kSid
   }
   /// NaN where κ is not allowed.
   T largest_in_row(int i) const {
-    const bool allowed = !(kappa_[i % G::kPoints] <= T(0));
+    bool allowed = true;
+    for (int k = 0; k < kKappas; ++k) allowed = allowed && !(kappa_[k * G::kPoints + i % G::kPoints] <= T(0));
     return allowed ? OperatorRows<Diffusion, T>::largest_in_row(i) : std::numeric_limits<T>::quiet_NaN();
   }
   template <class F>
@@ -86,7 +88,8 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kSid
   T for_each_face(int i, const F& f, const Beyond& beyond = {}) const {
     const int point = i % G::kPoints;
     const G at(point);
-    T row_sum = (shift_ ? shift_[point] : shift_number_) + T(0) * kappa_[point];  // NaN where κ is not finite
+    T row_sum = shift_ ? shift_[point] : shift_number_;
+    for (int k = 0; k < kKappas; ++k) row_sum += T(0) * kappa_[k * G::kPoints + point];  // NaN where κ is not finite
     row_sum += face<0, 0>(at, i, f, beyond) + face<0, 1>(at, i, f, beyond);
     row_sum += face<1, 0>(at, i, f, beyond) + face<1, 1>(at, i, f, beyond);
     row_sum += face<2, 0>(at, i, f, beyond) + face<2, 1>(at, i, f, beyond);
@@ -98,17 +101,19 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kSid
     constexpr int side = sides[2 * axis + end], extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
     const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x, point = at.point();
     const T scale = inverse_width_[axis] * inverse_width_[axis];
+    constexpr int own = axis + kKappas - 3;  // below 0 on axes of one cell, which need none
+    const T* const kappa = kappa_ + (kKappas == 1 || own < 0 ? 0 : own) * G::kPoints;
     constexpr int cells = end == 0 ? -1 : 1;
     constexpr bool wraps = side == kPeriodicSide && n > 1;
     const int next = moved<n, cells, wraps>(here);
     if (next >= 0) {
       constexpr int stride = axis == 0 ? G::kY * G::kX : axis == 1 ? G::kX : 1;
       const int there = point + (next - here) * stride;
-      f(scale * mean(kappa_[point], kappa_[there]), i - point + there, axis, cells);
+      f(scale * mean(kappa[point], kappa[there]), i - point + there, axis, cells);
       return 0;
     }
     if constexpr (side != kZeroSide && side != kRobinSide) return 0;
-    const T conductance = side_conductance<axis, end>(at, 2 * scale * kappa_[point]);
+    const T conductance = side_conductance<axis, end>(at, 2 * scale * kappa[point]);
     beyond(conductance, axis, cells);
     return conductance;
   }

@@ -17,12 +17,13 @@ struct SideField {
   T at(int s, int on_side) const { return values ? values[s * sample + on_side * step] : number; }
 };
 
-/// Of κ, (batch or 1, *shape), then of the shift and of h of each Robin side, in one loop. Axes are z, y and x.
+/// Of κ, (batch or 1, kappas, *shape), then of the shift and of h of each Robin side, in one loop. Axes are z, y and x;
+/// κ is that of all, or of each of the last `kappas`.
 template <class T>
 struct DiffusionProductRule {
   static constexpr int kSums = 7;
   PairOfVectors<T> pair;  // for the sets of κ
-  int batch, n[3], sides[6];
+  int batch, kappas, n[3], sides[6];
   double inverse_width[3];
   bool harmonic;
   const T* kappa;
@@ -32,9 +33,9 @@ struct DiffusionProductRule {
   double* sums_out[kSums];
 
   void operator()(int i) const {
-    const int entries = batch / pair.samples * pair.points;
+    const int entries = batch / pair.samples * kappas * pair.points, row = i / pair.points;
     if (i < entries) {
-      kappa_out[i] = kappa_bar(i / pair.points, i % pair.points);
+      kappa_out[i] = kappa_bar(row / kappas, row % kappas, i % pair.points);
       return;
     }
     i -= entries;
@@ -50,31 +51,35 @@ struct DiffusionProductRule {
     const int64_t k = (static_cast<int64_t>(s) * pair.channels + channel) * pair.points + point;
     return pair.lambda[k] * pair.u[k];
   }
-  T kappa_at(int s, int point) const { return kappa[static_cast<int64_t>(s / pair.samples) * pair.points + point]; }
+  /// Which κ is that of an axis.
+  int kappa_of(int axis) const { return kappas == 1 ? 0 : axis + kappas - 3; }
+  T kappa_at(int s, int axis, int point) const {
+    return kappa[(static_cast<int64_t>(s / pair.samples) * kappas + kappa_of(axis)) * pair.points + point];
+  }
 
-  T kappa_bar(int set, int point) const {
+  T kappa_bar(int set, int which, int point) const {
     const int at[3] = {point / (n[2] * n[1]), point / n[2] % n[1], point % n[2]};
     const int strides[3] = {n[2] * n[1], n[2], 1};
     T sum = 0;
     for (int side = 0; side < 6; ++side) {
       const int axis = side / 2, next = at[axis] + (side % 2 ? 1 : -1);
-      if (next >= 0 && next < n[axis])
-        sum += through(set, point, point + (next - at[axis]) * strides[axis], scale(axis));
+      if (kappa_of(axis) != which) continue;
+      if (next >= 0 && next < n[axis]) sum += through(set, point, point + (next - at[axis]) * strides[axis], axis);
       else if (sides[side] == kPeriodicSide && n[axis] > 1)
-        sum += through(set, point, point + (next < 0 ? n[axis] - 1 : 1 - n[axis]) * strides[axis], scale(axis));
+        sum += through(set, point, point + (next < 0 ? n[axis] - 1 : 1 - n[axis]) * strides[axis], axis);
       else if (sides[side] == kZeroSide)
         sum += 2 * scale(axis) * pair.sum(set, [&](T& all, const T* l, const T* v) { all += v[point] * l[point]; });
       else if (sides[side] == kRobinSide) sum += 2 * scale(axis) * on_robin(set, side, at, point);
     }
     return sum;
   }
-  T through(int set, int here, int there, T scale) const {
-    const T coupled = scale * pair.sum(set, [&](T& sum, const T* l, const T* v) {
+  T through(int set, int here, int there, int axis) const {
+    const T coupled = scale(axis) * pair.sum(set, [&](T& sum, const T* l, const T* v) {
       sum += (v[there] - v[here]) * (l[there] - l[here]);
     });
     if (!harmonic) return coupled * T(0.5);
     const int s = set * pair.samples;
-    const T part = kappa_at(s, there) / (kappa_at(s, here) + kappa_at(s, there));
+    const T part = kappa_at(s, axis, there) / (kappa_at(s, axis, here) + kappa_at(s, axis, there));
     return coupled * (part == part ? 2 * part * part : T(0));  // 0 where κ is not finite: the sample was refused
   }
   T on_robin(int set, int side, const int (&at)[3], int point) const {
@@ -91,7 +96,7 @@ struct DiffusionProductRule {
   T squared_share(int s, int side, const int (&at)[3], int point, bool of_side) const {
     const int axis = side / 2;
     const int on_side = axis == 0 ? at[1] * n[2] + at[2] : axis == 1 ? at[0] * n[2] + at[2] : at[0] * n[1] + at[1];
-    const T within = 2 * scale(axis) * kappa_at(s, point);
+    const T within = 2 * scale(axis) * kappa_at(s, axis, point);
     const T beyond = static_cast<T>(inverse_width[axis]) * robin[side].at(s, on_side);
     const T part = (of_side ? beyond : within) / (within + beyond);
     return part == part ? part * part : T(0);
