@@ -42,10 +42,24 @@ class StepOfRollout {
   std::optional<FailuresOfStep> here_;
 };
 
-/// Python's warnings module; a filter may turn the warning into an exception.
+std::vector<std::string> library_folders;  // of this package and of torch
+
+/// The level of the innermost frame on Python's stack that is neither ours nor torch's; 1 where there is none.
+int level_of_user() {
+  int level = 1;
+  auto frame = py::reinterpret_borrow<py::object>(reinterpret_cast<PyObject*>(PyEval_GetFrame()));
+  for (; frame && !frame.is_none(); frame = frame.attr("f_back"), ++level) {
+    const auto file = frame.attr("f_code").attr("co_filename").cast<std::string>();
+    const auto holds = [&](const std::string& folder) { return file.compare(0, folder.size(), folder) == 0; };
+    if (std::none_of(library_folders.begin(), library_folders.end(), holds)) return level;
+  }
+  return 1;
+}
+
+/// Python's warnings module, which names the user's line; a filter may turn the warning into an exception.
 void warn_in_python(const std::string& text) {
   const py::gil_scoped_acquire gil;
-  if (PyErr_WarnEx(PyExc_UserWarning, text.c_str(), 1) != 0) throw py::error_already_set();
+  if (PyErr_WarnEx(PyExc_UserWarning, text.c_str(), level_of_user()) != 0) throw py::error_already_set();
 }
 
 /// A function of the user's in Python.
@@ -190,6 +204,8 @@ void bind_reports(py::module_& m) {
 }  // namespace
 
 void bind_solvers(py::module_& m) {
+  for (const char* package : {"prdp_torch", "torch"})
+    library_folders.push_back(py::str(py::module_::import(package).attr("__path__")[py::int_(0)]));
   set_warning_sink(warn_in_python);
   main_thread = py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
   interruption::set_check(check_signals);
