@@ -11,7 +11,7 @@ from torch import Tensor
 
 from prdp_torch import _check, operators, torch_private
 from prdp_torch.closures import closed_over, warn_of_shared
-from prdp_torch.operators.matrix import as_operator
+from prdp_torch.operators.matrix import as_operator, hint_for
 from prdp_torch.solvers import Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.types import Backward, StepOptions
@@ -65,8 +65,10 @@ class ImplicitStep(Stepper):
                     "give operators.Matrix.csr(crow, col, values, size) with a Parameter as values"
                 )
             operator = ConstantOperator(operator)
-        if not callable(operator):
-            raise TypeError(f"{who}: operator must be a function of u or an operator, got {operator!r}")
+        if not callable(operator) or isinstance(operator, Stepper):
+            raise TypeError(
+                f"{who}: operator must be a function of u or an operator, got {operator!r}{hint_for(operator)}"
+            )
         if rhs is not None and not callable(rhs):
             raise TypeError(f"{who}: rhs must be a function of u or None, got {_check.shown(rhs)}")
         self.operator_at = operator

@@ -120,6 +120,9 @@ def preconditioner_of(solver: Solver) -> Preconditioner:
     return None if isinstance(solver, Multigrid) else solver.preconditioner
 
 
+FOR_SYMMETRIC = CG, MINRES, SteepestDescent
+
+
 def candidates(step: Stepper) -> list[Solver]:
     """The solvers to try on a step. The systems of a `Flow` are symmetric, and do not depend on the state."""
     if isinstance(step, Flow):
@@ -150,7 +153,7 @@ def measure(step: Stepper, sample: Tensor, solvers: Sequence[Solver], seconds: f
     rows, refused = [], []
     for solver in solvers:
         try:
-            if isinstance(solver, CG) and not symmetric:
+            if isinstance(solver, FOR_SYMMETRIC) and not symmetric:
                 raise ValueError("A is not symmetric")
             if isinstance(solver, Direct):
                 _check_direct(trial, seconds)

@@ -171,7 +171,8 @@ class Stepper(HasSettings):
         else:  # if nothing was solved, way_of_last_solve() would describe an earlier solve
             info = SolveInfo(*kept, log, "" if compiling or not kept[0].numel() else _C.way_of_last_solve())
         if compiling:
-            self.info = info
+            if not torch.compiler.is_exporting():  # which warns of attributes that it leaves behind
+                self.info = info
         else:  # past __setattr__ of modules, which takes as long as a small solve
             self.__dict__["info"] = info
 
@@ -196,8 +197,13 @@ class Stepper(HasSettings):
 
     def _solve_from(self, u: Tensor, log: AdjointLog) -> Solution:
         who, compiling = type(self).__name__, torch.compiler.is_compiling()
+        writes = None if compiling or u.is_inference() else u._version
         a = as_operator(who, "operator(u)", self.operator(u))
         b = self._rhs_with(u, a)
+        if writes is not None and u._version != writes:
+            raise ValueError(
+                f"{who}: operator or rhs changes the state u in place; it must return a new tensor and leave u as it is"
+            )
         if not compiling:
             _check.dense(who, "rhs(u)", b)
         b = full_precision(b)

@@ -42,7 +42,7 @@ TEST(Failures, NameOperatorSampleAndRemedy) {
               {"1 of 1 samples failed: sample 0 DIVERGED", "Jacobi on Matrix:", "larger than 1", "take GMRES"});
   expect_said(prdp::matrix(swap), e1, prdp::Jacobi{5}, {"ZERO_DIAGONAL in row (0)", "take GMRES"});
   expect_said(prdp::matrix(swap), e1, prdp::CG{.max_iter = 5},
-              {"BREAKDOWN", "CG on Matrix:", "A is symmetric but not definite; take MINRES"});
+              {"BREAKDOWN", "CG on Matrix:", "A is symmetric but not definite to float64: take MINRES"});
   expect_said(prdp::matrix(turn), e1, prdp::SteepestDescent{5},
               {"BREAKDOWN", "A is not symmetric", "With OnFailure::kReturn, what there is"});  // in C++'s words
   expect_said(prdp::matrix(ones), e1, prdp::GMRES{.restart = 2, .max_iter = 9},

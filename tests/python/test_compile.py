@@ -138,6 +138,7 @@ def test_torch_export_records_a_step_and_torch_jit_trace_says_that_it_cannot():
     step, u = prdp.Heat((8,), 0.3, 0.1, prdp.CG(20)), field((8,))
     exported = torch.export.export(torch.nn.Sequential(step), (u,)).module()
     torch.testing.assert_close(exported(u), step(u), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(torch.export.export(step, (u,)).module()(u), step(u), rtol=0.0, atol=0.0)
     heat = operators.Heat((8,), 0.3, 0.1)
     for run in (step, lambda b: prdp.linear_solve(heat, b, prdp.CG(20))[0]):
         with pytest.raises(TypeError, match="trace cannot record a solve of prdp_torch"):

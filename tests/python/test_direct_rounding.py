@@ -134,3 +134,14 @@ def test_a_diffusion_that_loses_what_holds_u_in_its_factors_is_refused(dtype, sh
     assert refused == sorted(refused) and refused[-1] and not refused[2]
     with pytest.raises(torch.linalg.LinAlgError, match=r"Direct on Diffusion: (what holds u, a shift|A is singular)"):
         prdp.linear_solve(a, b, prdp.Direct())
+
+
+@pytest.mark.filterwarnings("ignore:.* STAGNATED far above rtol", "ignore:.* with a residual above")
+def test_on_a_fine_grid_in_float32_it_is_solved_as_well_as_the_dtype_allows():
+    """Its sums over 1,023 points leave some ten roundings of a product."""
+    b = noise(1, 1, 1023, 1023)
+    poisson = prdp.Poisson((1023, 1023), prdp.Direct())
+    u = poisson(b.float())
+    assert poisson.info.solved.all() and poisson.info.floor[0] < poisson.info.residual[0] < 32 * poisson.info.floor[0]
+    exact = poisson(b)
+    assert (u - exact).norm() < 1e-5 * exact.norm()

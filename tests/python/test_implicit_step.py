@@ -278,6 +278,12 @@ HEAT = operators.Heat((N,), 1e-2, 0.5)
             ValueError,
             r"rhs must return the shape .*\(2, 1, 9\) in torch.float",
         ),
+        (lambda: run(HEAT, lambda u: u.add_(1.0)), ValueError, "operator or rhs changes the state u in place"),
+        (
+            lambda: run(prdp.Heat((9,), 1.0, 1.0, prdp.CG(3))),
+            TypeError,
+            "a function of u or an operator, got Heat.*which is a stepper; see operators.Heat",
+        ),
         (lambda: run(HEAT, lambda u: u.float()), ValueError, "rhs must return the shape and dtype of the state"),
         (lambda: run(HEAT, lambda u: None), TypeError, r"rhs\(u\) must be a torch tensor, got NoneType"),
         (lambda: run(torch.eye(8), u=torch.ones(8)), ValueError, r"u must have shape \(batch, ...\), got \(8,\)"),

@@ -94,7 +94,7 @@ def make_rhs(operator, way, dtype):
 
 
 # Where a failure must come up: what is to be said with it, and of which methods and operators.
-KRYLOV = r"A is (not symmetric \(‖A v - Aᵀ v‖ is [\d.]+ ‖A v‖ .*\)|symmetric but not definite); take (GMRES|MINRES)"
+KRYLOV = r"A is (not symmetric \(‖A v - Aᵀ v‖ is [\d.]+ ‖A v‖ .*\)|symmetric but not definite to float..)[;:] take (GMRES|MINRES)"
 WAYS = {
     "nan": ("NONFINITE_INPUT", r" at index \((0, )*1\), ",
             "the (right-hand side|cotangent) is NaN or Inf there; look at", PAIRS),
@@ -108,7 +108,7 @@ WAYS = {
              f"r·A r is zero for a residual r(: {KRYLOV}|; take GMRES)",
              [(m, o) for m in ("SteepestDescent", "CG", "BiCGStab") for o in ("Function", "Matrix", "CSR")]),
     "singular": ("BREAKDOWN", r" \(the iterate .*\), ",
-                 "(A is singular; GMRES solves it|.*A is singular, and b lies outside its range; take a b"
+                 "(A is singular; GMRES solves it|.*A is singular, and b lies outside its range[;,].* take a b"
                  f"|.*{KRYLOV}|r·A r is zero for a residual r; take GMRES)",
                  [(m, o) for m in ("CG", "BiCGStab", "GMRES(3)", "Direct") for o in ("Function", "Matrix", "CSR")]
                  + [(m, o) for m in DIVIDING if m != "Jacobi" for o in ("Matrix", "CSR")]),

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/singular_operator.h"
@@ -14,6 +15,8 @@
 namespace prdp {
 
 namespace {
+
+constexpr const char* kUnheld = "neither the shift nor a side holds u, so A is singular";
 
 /// `t` in this dtype; a number of the host without operations of torch, four of them, where autograd does not care.
 at::Tensor in_dtype(const at::Tensor& t, at::ScalarType dtype) {
@@ -55,7 +58,7 @@ OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const s
 }
 
 DiffusionOperator::DiffusionOperator(const OperatorSpec& spec)
-    : shape_(spec.shape), per_axis_(spec.kind.ends_with("_per_axis")) {
+    : shape_(spec.shape), per_axis_(spec.kind.ends_with("_per_axis")), names_null_space_(is_singular(spec)) {
   TORCH_CHECK_VALUE(spec.tensors.size() >= 2, "Diffusion: takes the tensors kappa, shift, and h of each Robin side");
   const auto &kappa = spec.tensors[0], &shift = spec.tensors[1];
   auto of_sample = shape_;
@@ -148,6 +151,31 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
                       t.device(), " but the vector is on ", b.device());
 }
 
+at::Tensor DiffusionOperator::unheld() const {
+  bool by_values = shift_.dim() > 0;
+  for (const auto& h : robin_) by_values = by_values || h.dim() > 0;
+  if (names_null_space_ || known_held_ || !by_values) return {};
+  for (const auto& of_axis : sides_)
+    if (of_axis[0] == Side::kZero || of_axis[1] == Side::kZero) return {};
+  const auto in_each = [&](const at::Tensor& t) {
+    const auto there = t.detach().ne(0).to(kappa_.device());
+    return there.dim() == 0 ? there.view({1}) : there.flatten(1).any(1);
+  };
+  auto held = in_each(shift_);
+  for (const auto& h : robin_) held = held.logical_or(in_each(h));
+  return held.logical_not();
+}
+
+at::Tensor DiffusionOperator::shift_or_nan() const {
+  const auto lost = unheld();
+  if (!lost.defined()) return shift_;
+  std::vector<int64_t> of_samples(shape_.size() + 2, 1), field{-1, 1};
+  of_samples[0] = lost.size(0);
+  field.insert(field.end(), shape_.begin(), shape_.end());
+  const auto added = at::zeros(of_samples, kappa_.options()).masked_fill(lost.view(of_samples), NAN);
+  return (shift_ + added).expand(field);
+}
+
 void DiffusionOperator::check_parameters(Checks checks) const {
   for (const auto& [name, t] : tensors())
     if (at::isTensorSubclassLike(t) || t.is_meta() || t.numel() == 0) return;  // no numbers, or none yet
@@ -158,6 +186,14 @@ void DiffusionOperator::check_parameters(Checks checks) const {
                       "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
   }
   if (checks == Checks::kHost) return;
+  if (const auto lost = unheld(); lost.defined()) {
+    const bool any = lost.any().item<bool>();
+    known_held_ = !any;
+    const bool is_refused = any && (checks != Checks::kShared || lost.size(0) == 1);
+    TORCH_CHECK_VALUE(!is_refused, "Diffusion: in sample ", first_true(lost)[0], " ", kUnheld,
+                      "; if that is meant, give ", in_language("shift=0.0", "0.0 as shift"),
+                      ", a number, which makes the constant the null space of all samples");
+  }
   known_positive_ = kappa_.min().item<double>() > 0.0;
   if (known_positive_) return;
   const auto wrong = kappa_.le(0);
@@ -190,7 +226,11 @@ std::vector<int64_t> DiffusionOperator::first_nonfinite(int64_t sample) const {
 
 std::string DiffusionOperator::refusal(int64_t sample) const {
   const auto found = first_refused(sample);
-  if (!found || !std::isfinite(found->value)) return {};
+  if (!found) {
+    const auto lost = unheld();
+    return lost.defined() && lost[lost.size(0) == 1 ? 0 : sample].item<bool>() ? kUnheld : "";
+  }
+  if (!std::isfinite(found->value)) return {};
   std::ostringstream text;
   text << found->must << ", got " << found->value;
   return text.str();

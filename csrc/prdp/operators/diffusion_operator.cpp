@@ -191,8 +191,11 @@ std::vector<int64_t> DiffusionOperator::vector_shape() const { return with_chann
 
 std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Tensor& b, bool /*transposed*/) const {
   const at::NoGradGuard no_grad;
-  const StencilOperator stencil(as_stencil());
-  return takes_differences() ? stencil.kernels_by_differences(b, shift_) : stencil.kernels(b, /*transposed=*/false);
+  auto marked = *this;
+  marked.shift_ = shift_or_nan();
+  const StencilOperator stencil(marked.as_stencil());
+  return takes_differences() ? stencil.kernels_by_differences(b, marked.shift_)
+                             : stencil.kernels(b, /*transposed=*/false);
 }
 
 std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b, bool /*transposed*/) const {
@@ -211,7 +214,7 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
   view.tensors[kKappa] = kappa_.contiguous();
   auto field = kappa_.sizes().vec();
   field[0] = field[1] = 1;
-  take(shift_, field, kShift, kShiftNumber);
+  take(shift_or_nan(), field, kShift, kShiftNumber);
   for (size_t axis = 0; axis < 3; ++axis) {
     const int64_t d = static_cast<int64_t>(axis) - 3 + dim();
     for (size_t end = 0; end < 2; ++end) {

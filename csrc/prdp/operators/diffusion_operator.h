@@ -43,7 +43,7 @@ class DiffusionOperator final : public Operator {
   explicit DiffusionOperator(const OperatorSpec& spec);
 
   void check_vector(const at::Tensor& b) const override;
-  /// Raises ValueError unless kappa > 0 and h >= 0.
+  /// Raises ValueError unless kappa > 0, h >= 0, and a side or the shift holds u where no null space is named.
   void check_parameters(Checks checks) const override;
   std::string refusal(int64_t sample) const override;
   at::Tensor apply(const at::Tensor& v) const override;
@@ -90,6 +90,11 @@ class DiffusionOperator final : public Operator {
     std::vector<int64_t> index;
   };
   std::optional<Refused> first_refused(int64_t sample) const;
+  /// Samples whose shift and h of every Robin side are zero, while no other side holds u: a tensor (batch or 1). There
+  /// A is singular, and as others hold u, no null space is named. Undefined where that cannot be.
+  at::Tensor unheld() const;
+  /// The shift, with NaN in these samples, which then are refused.
+  at::Tensor shift_or_nan() const;
   void take_robin(const std::vector<at::Tensor>& tensors, int64_t axis, size_t end);
   const at::Tensor& robin(int64_t axis, size_t end) const;
   std::vector<std::pair<const char*, at::Tensor>> tensors() const;
@@ -103,8 +108,8 @@ class DiffusionOperator final : public Operator {
   std::vector<std::array<Side, 2>> sides_;
   std::vector<double> lengths_;
   FaceMean mean_;
-  bool per_axis_;
-  mutable bool known_positive_ = false;  // κ, by check_parameters(), so that no product need look again
+  bool per_axis_, names_null_space_;
+  mutable bool known_positive_ = false, known_held_ = false;  // by check_parameters(), so that nobody looks again
   // With an axis of one channel, or of those of κ, and one of extent 1 where a side has none; or 0-dimensional.
   at::Tensor kappa_, shift_;
   std::vector<at::Tensor> robin_;  // h of each Robin side, in their order

@@ -9,9 +9,9 @@
 #include "prdp/error_text.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/kinds.h"
-#include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
+#include "prdp/solvers/null_space_messages.h"
 #include "prdp/solvers/unfit.h"
 #include "prdp/solvers/unnamed_null_space.h"
 
@@ -41,27 +41,7 @@ bool is_finite(const Operator& a, const at::Tensor& b, int64_t sample) {
   return a.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>();
 }
 
-/// Whether the null space of A is known: somebody named it, or it is that of a pressure.
-bool knows_null_space(const SolveRole& role) { return is_singular(role.a) || operator_kind(role.a.kind).has_pressure; }
-
-/// How to name the constant that A, or Aᵀ if `transposed`, maps to zero: that of each channel, or of all together.
-std::string name_the_null_space(const Operator& a, const at::Tensor& b, int64_t sample, bool transposed) {
-  if (b.dim() < 3 || b.size(1) == 1 || maps_constant_to_zero(a, b, transposed)[sample].item<bool>())
-    return std::string("give ") + in_language("nullspace=\"constant\" to the operator", "prdp::with_null_space(a)") +
-           ", or all vectors if it maps more to zero";
-  return c10::str("give that of all channels together as a vector, ",
-                  in_language("nullspace=torch.ones", "prdp::with_null_space(a, at::ones"), "(1, ",
-                  c10::Join(", ", b.sizes().slice(1)), ")", in_language("", ")"), " in the dtype of b");
-}
-
-/// Where A maps the constant to zero, though nobody named its null space: that, in words. Else empty. Operators of the
-/// library know their own.
-std::string undeclared_null_space(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  const bool is_there = a.may_be_singular() && !knows_null_space(role) &&
-                        maps_constant_to_zero(a, b, /*transposed=*/false, /*jointly=*/true)[sample].item<bool>();
-  if (!is_there) return {};
-  return "A maps the constant to zero, so it is singular; " + name_the_null_space(a, b, sample, /*transposed=*/false);
-}
+bool is_diffusion(const OperatorSpec& a) { return std::string_view(operator_kind(a.kind).title) == "Diffusion"; }
 
 /// Where the rows of A, or its columns, differ so much in size that the dtype loses the small ones beside the large
 /// ones: that, in words. Else empty.
@@ -94,7 +74,10 @@ std::string not_definite(const SolveRole& role, const Operator& a, const at::Ten
   if (b.scalar_type() == at::kFloat && row_sums_are_rounding(a, b, sample))
     return "what keeps A from being singular, such as its shift, is lost in the rounding of float32; take float64";
   if (auto found = asymmetric(role, a, b, sample); !found.empty()) return found;
-  return "A is symmetric but not definite; take MINRES, or name all its null vectors (nullspace) if it is singular";
+  const bool single = b.scalar_type() == at::kFloat;
+  return std::string("A is symmetric but not definite to ") + (single ? "float32" : "float64") +
+         ": take MINRES if it is indefinite, name all its null vectors (nullspace) if it is singular, and take " +
+         (single ? "float64" : "Direct") + " if it is ill-conditioned";
 }
 
 /// Where a preconditioner of the user's own hands out NaN or Inf: that, in words. Else empty.
@@ -151,7 +134,9 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
 std::string breakdown(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto& solver = role.solver;
   if (traits(solver.method).is_direct)
-    return std::string("A is singular") + (b.scalar_type() == at::kFloat ? " to float32; take float64, or" : ";") +
+    return std::string("A is singular") +
+           (b.scalar_type() == at::kFloat ? " to float32, or nearly so; take float64. If it is singular there, too,"
+                                          : ";") +
            " GMRES solves it for any b in the range of A, and Direct where all null vectors are named";
   if (traits(solver.method).made_for == MadeFor::kDefinite && solver.preconditioner.is_operator())
     return std::string(
@@ -164,13 +149,17 @@ std::string breakdown(const SolveRole& role, const Operator& a, const at::Tensor
   if (maps_ones_to_zero(solver.preconditioner, b, sample))
     return "its preconditioner maps a vector of ones to zero; look at what M⁻¹ is made of";
   if (traits(solver.method).counts == Counts::kIterations) return "r·A r is zero for a residual r; take GMRES";
-  return "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range; "
-         "take a b without that part, or add a multiple of the identity to A";
+  const bool single = b.scalar_type() == at::kFloat;
+  return std::string(
+             "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range, or A "
+             "is too ill-conditioned for ") +
+         (single ? "float32; take float64 to tell, or" : "float64; if it is singular, take") + " a b without that part";
 }
 
 /// Why the factors of a diffusion lose what `Direct` needs of it (Kernel::has_definite_factors), in words. Else empty.
 std::string lost_in_factors(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (!traits(role.solver.method).is_direct || !role.a.kind.starts_with("diffusion")) return {};
+  // Of a singular one nothing holds u.
+  if (!traits(role.solver.method).is_direct || !is_diffusion(role.a) || is_singular(role.a)) return {};
   const auto of = [&](const at::Tensor& t) { return t.expand_as(b).select(0, sample).to(at::kDouble).abs(); };
   const auto diagonal = of(a.diagonal()), row_sums = of(a.apply(at::ones_like(b)));
   if ((diagonal.max() / diagonal.min()).item<double>() >= kernels::kWidestRowsOfFactors)
@@ -187,9 +176,9 @@ std::string stagnated(const SolveRole& role, const Operator& a, const at::Tensor
   const auto& solver = role.solver;
   if (auto found = unfit(role, a, b, sample); !found.empty()) return found;
   const bool single = b.scalar_type() == at::kFloat;
-  if (single && role.a.kind.starts_with("diffusion") && solver.method == Method::kConjugateGradient)
-    return "the residual falls no further in float32; where κ jumps, u may be right all the same: solve it once with "
-           "Direct to see, and if it is, stay there";
+  if (single && is_diffusion(role.a) && solver.method == Method::kConjugateGradient)
+    return "the residual falls no further in float32; where κ jumps or little holds u, u may be right all the same: "
+           "solve it once in float64 to see, and if it is, stay there";
   if (traits(solver.method).counts == Counts::kCycles)
     return "its cycles take nothing more off the residual; take a larger restart, " +
            std::string(solver.preconditioner.is_multigrid() ? "no multigrid" : "a preconditioner") + ", or Direct" +
@@ -207,13 +196,17 @@ std::string stagnated(const SolveRole& role, const Operator& a, const at::Tensor
 std::string stopped(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto& solver = role.solver;
   if (auto found = unfit(role, a, b, sample); !found.empty()) return found;
-  const bool holds_weakly = role.a.kind.starts_with("diffusion") && b.scalar_type() == at::kFloat;
+  const bool holds_weakly = is_diffusion(role.a) && b.scalar_type() == at::kFloat;
   if (solver.preconditioner.is_multigrid() && holds_weakly && solver.method != Method::kConjugateGradient)
     return "in float32 its coarse grids may lose what keeps A from being singular; take CG with multigrid, Direct or "
            "float64";
   if (solver.preconditioner.is_multigrid())
     return "its cycles may not be made for this A, as for a wind in central differences that is strong beside the "
            "diffusion; take upwind differences, leave out multigrid, or take Direct";
+  if (traits(solver.method).is_direct)
+    return "its residual is above the rounding of a product, though u may be right; " +
+           std::string(b.scalar_type() == at::kFloat ? "solve it in float64 once to see" : "scale A and b") +
+           ", or refine it by a larger max_iter";
   return "take more iterations, a preconditioner, GMRES or Direct";
 }
 
@@ -232,28 +225,6 @@ std::string zero_diagonal(const SolveRole& role, const Operator& a, const at::Te
   return why + (role.solver.preconditioner.is_diagonal() && takes_any_diagonal(role.solver.method)
                     ? "; take " + std::string(traits(role.solver.method).label) + " without it"
                     : "; take GMRES");
-}
-
-std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (!knows_null_space(role))
-    return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which " +
-           (role.adjoint ? "Aᵀ" : "A") + " cannot reach, as " + (role.adjoint ? "A" : "Aᵀ") +
-           " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") +
-           name_the_null_space(a, b, sample, /*transposed=*/true);
-  const auto outside = (b - a.project(b)).select(0, sample);
-  const auto share = three_digits(100.0 * norm_of(outside) / norm_of(b.select(0, sample))) + " % of ";
-  if (!operator_kind(role.a.kind).has_pressure) {
-    const auto fields = outside.dim() > 1 ? outside.flatten(1) : outside.unsqueeze(0);
-    const bool is_constant =
-        norm_of(fields - fields.mean(1, /*keepdim=*/true)) <= std::sqrt(epsilon_of(b)) * norm_of(outside);
-    return share + "b lies outside the range of A" +
-           (is_constant ? "; take the mean off b" : "; take a b without that part");
-  }
-  if (role.adjoint)
-    return share +
-           "the cotangent is the mean of its pressure, which the step leaves free; take the mean off the "
-           "pressure that the loss is made of";
-  return share + "b is the mean of its pressure channel, which no flow can have; take it off";
 }
 
 }  // namespace

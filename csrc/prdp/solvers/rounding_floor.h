@@ -18,12 +18,14 @@ auto rounding_floors(Space& space, const Method& method) {
   return floors;
 }
 
-/// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor, or below 8 floors for
-/// direct methods, which reach no lower; 100 where a space is exhausted.
+/// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor; 32 for direct methods
+/// where rtol lies below that, as their sums are long; 100 where a space is exhausted.
 template <class Method>
 double slack_of_floor(const SampleState& s, double rtol, double floor) {
   if (s.status == SolveStatus::kBreakdown) return 100.0;
-  return rtol * std::sqrt(s.b2) <= (kIsExact<Method> ? 8.0 : 1.0) * floor ? 8.0 : 1.0;
+  const double target = rtol * std::sqrt(s.b2);
+  if (kIsExact<Method>) return target <= 32.0 * floor ? 32.0 : 1.0;
+  return target <= floor ? 8.0 : 1.0;
 }
 
 /// Per sample: its floor, if it is `doubtful` and its residual is at most slack_of_floor() floors; else 0. Never a

@@ -40,7 +40,7 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
   /// NaN where κ is not allowed.
   T largest_in_row(int i) const {
     bool allowed = true;
-    for (int k = 0; k < kKappas; ++k) allowed = allowed && !(kappa_[k * G::kPoints + i % G::kPoints] <= T(0));
+    for (int k = 0; k < kKappas; ++k) allowed = allowed && !(kappa_[int64_t{k} * G::kPoints + i % G::kPoints] <= T(0));
     return allowed ? OperatorRows<Diffusion, T>::largest_in_row(i) : std::numeric_limits<T>::quiet_NaN();
   }
   template <class F>
@@ -89,7 +89,8 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
     const int point = i % G::kPoints;
     const G at(point);
     T row_sum = shift_ ? shift_[point] : shift_number_;
-    for (int k = 0; k < kKappas; ++k) row_sum += T(0) * kappa_[k * G::kPoints + point];  // NaN where κ is not finite
+    for (int k = 0; k < kKappas; ++k)
+      row_sum += T(0) * kappa_[int64_t{k} * G::kPoints + point];  // NaN where κ is not finite
     row_sum += face<0, 0>(at, i, f, beyond) + face<0, 1>(at, i, f, beyond);
     row_sum += face<1, 0>(at, i, f, beyond) + face<1, 1>(at, i, f, beyond);
     row_sum += face<2, 0>(at, i, f, beyond) + face<2, 1>(at, i, f, beyond);
@@ -102,7 +103,7 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
     const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x, point = at.point();
     const T scale = inverse_width_[axis] * inverse_width_[axis];
     constexpr int own = axis + kKappas - 3;  // below 0 on axes of one cell, which need none
-    const T* const kappa = kappa_ + (kKappas == 1 || own < 0 ? 0 : own) * G::kPoints;
+    const T* const kappa = kappa_ + (kKappas == 1 || own < 0 ? int64_t{0} : int64_t{own}) * G::kPoints;
     constexpr int cells = end == 0 ? -1 : 1;
     constexpr bool wraps = side == kPeriodicSide && n > 1;
     const int next = moved<n, cells, wraps>(here);
