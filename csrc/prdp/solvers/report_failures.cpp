@@ -240,15 +240,16 @@ void warn_of_constant_cycles() {
   });
 }
 
-void warn_of_another_transpose(const void* code, int64_t sample, double of_solve, double of_adjoint) {
-  warn_once(c10::str("another transpose ", code), 0.0, [&](std::ostream& text) {
-    text << "adjoint solve: the gradient of sample " << sample
-         << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
-         << " and ⟨u, ū⟩ = " << of_adjoint << " should be equal. Is "
-         << in_language("`transpose` right, or A symmetric where symmetric=True", "`apply_transpose` right")
-         << "? Do the functions still see the tensors that they captured?"
-         << in_language(" prdp.check_operator tells", "");
-  });
+void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_solve, double of_adjoint) {
+  if (code.warned_of_transpose.exchange(true) && !c10::WarningUtils::get_warnAlways()) return;
+  std::ostringstream text;
+  text << "adjoint solve: the gradient of sample " << sample
+       << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
+       << " and ⟨u, ū⟩ = " << of_adjoint << " should be equal. Is "
+       << in_language("`transpose` right, or A symmetric where symmetric=True", "`apply_transpose` right")
+       << "? Do the functions still see the tensors that they captured?"
+       << in_language(" prdp.check_operator tells", "");
+  warn_this_once(text.str(), /*may_get_worse=*/false);
 }
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/operators/operator.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/solvers/solver.h"
 
 /// What is said of solves: errors for failed samples, and warnings where a result may mislead.
@@ -22,7 +23,8 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
 /// Says once that an unrolled gradient of A takes the cycles of multigrid for constants.
 void warn_of_constant_cycles();
 
-/// Warns that ⟨λ, b⟩ and ⟨u, ū⟩ of a sample differ, so that a Function's adjoint solve was made with another A.
-void warn_of_another_transpose(const void* code, int64_t sample, double of_solve, double of_adjoint);
+/// Warns that ⟨λ, b⟩ and ⟨u, ū⟩ of a sample differ, so that a Function's adjoint solve was made with another A: once
+/// for this `code`.
+void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_solve, double of_adjoint);
 
 }  // namespace prdp
