@@ -195,7 +195,7 @@ at::Tensor FunctionOperator::solve_directly(const at::Tensor& b, bool transposed
   const auto product = [&](const at::Tensor& v) { return transposed ? apply_transpose(v) : apply(v); };
   check_dense_fits(b, b.numel() / std::max<int64_t>(b.size(0), 1), b.size(0));
   const auto matrix = matrix_by_columns(product, b);
-  norm_of_matrix_ = matrix.detach().abs().sum(transposed ? -2 : -1).amax(-1).to(at::kDouble);
+  norms_of_matrix_[transposed] = matrix.detach().abs().sum(-1).amax(-1).to(at::kDouble);
   return solve(matrix, b);
 }
 
@@ -235,8 +235,12 @@ void FunctionOperator::check_is_recorded(const at::Tensor& u) const {
                     in_language("numpy and torch.no_grad()", "NoGradGuard"), ", or detach its tensors");
 }
 
-at::Tensor FunctionOperator::norm() const {
-  if (norm_of_matrix_.defined()) return norm_of_matrix_;
+at::Tensor FunctionOperator::norm() const { return norm_of(/*transposed=*/false); }
+
+at::Tensor FunctionOperator::norm_of_transpose() const { return norm_of(/*transposed=*/true); }
+
+at::Tensor FunctionOperator::norm_of(bool transposed) const {
+  if (norms_of_matrix_[transposed].defined()) return norms_of_matrix_[transposed];
   auto norm = at::scalar_tensor(0.0, at::kDouble);
   for (const auto& t : tensors_)
     if (holds_numbers(t))
