@@ -3,6 +3,7 @@
 #include "prdp/autograd/stored_iterates.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/operators/with_autograd.h"
 #include "prdp/solvers/solve_recorded.h"
 
 namespace prdp {

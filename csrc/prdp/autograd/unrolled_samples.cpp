@@ -10,7 +10,6 @@
 #include "prdp/autograd/solved_to_rounding.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/methods.h"
 #include "prdp/solvers/report_failures.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/solvers/verdicts.h"

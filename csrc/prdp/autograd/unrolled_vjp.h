@@ -4,7 +4,6 @@
 #include <vector>
 
 #include "prdp/autograd/solve_vjp.h"
-#include "prdp/operators/with_autograd.h"
 
 namespace prdp {
 

@@ -1,5 +1,8 @@
 #include <ATen/core/grad_mode.h>
 
+#include <limits>
+#include <variant>
+
 #include "prdp/error_text.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"

@@ -1,7 +1,5 @@
 #include "prdp/solvers/hierarchy_on_gpu.h"
 
-#include <ATen/Parallel.h>
-
 #include <algorithm>
 #include <limits>
 #include <sstream>

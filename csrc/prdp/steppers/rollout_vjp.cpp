@@ -7,7 +7,6 @@
 #include "prdp/autograd/op_results.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/stepper.h"
 
