@@ -15,8 +15,9 @@ struct SolveRole {
 };
 
 /// Raises c10::LinAlgError, warns or does nothing about failed samples, as `on_failure` says. The message names the
-/// samples, the operator, the cause and a remedy (failure_messages.h). Where none failed, it warns once of samples that
-/// stagnated far above rtol, unless nobody wants to hear of failures.
+/// samples, the operator, the cause and a remedy (failure_messages.h). If none failed, it warns once of samples that
+/// ended far from rtol. kReturn and kZeroGrad only warn of cotangents that are not finite, where the status is on the
+/// CPU.
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure);
 
