@@ -206,24 +206,17 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
   // the partial derivative must not follow a tensor's way through u.
   const bool create_graph = at::GradMode::is_enabled();
   return with_autograd([&] {
-    std::vector<at::Tensor> arguments, wanted;
+    std::vector<at::Tensor> arguments;
+    std::vector<int64_t> wanted;
     for (const auto& t : tensors_) {
       const bool recorded = create_graph && t.requires_grad();
       arguments.push_back(recorded ? t.view_as(t) : holds_numbers(t) ? t.detach().requires_grad_() : t);
-      if (arguments.back().requires_grad()) wanted.push_back(arguments.back());
+      wanted.push_back(arguments.back().requires_grad());
     }
-    std::vector<at::Tensor> gradients(tensors_.size());
-    if (wanted.empty()) return gradients;
+    if (std::find(wanted.begin(), wanted.end(), 1) == wanted.end()) return std::vector<at::Tensor>(tensors_.size());
     const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, product_name());
-    if (!made.requires_grad()) {
-      check_is_recorded(u);
-      return gradients;
-    }
-    const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()}, create_graph,
-                                             create_graph, /*allow_unused=*/true);
-    for (size_t i = 0, next = 0; i < tensors_.size(); ++i)
-      if (arguments[i].requires_grad()) gradients[i] = found[next++];
-    return gradients;
+    if (!made.requires_grad()) check_is_recorded(u);
+    return gradients_of({made}, {create_graph ? lambda : lambda.detach()}, arguments, wanted, create_graph);
   });
 }
 
