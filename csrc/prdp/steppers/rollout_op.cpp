@@ -9,6 +9,7 @@
 #include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/packed_equation.h"
 #include "prdp/steppers/rollout.h"
+#include "prdp/steppers/rollout_loops.h"
 #include "prdp/steppers/rollout_node.h"
 #include "prdp/steppers/stepper.h"
 

@@ -9,7 +9,7 @@
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/steppers/rollout_vjp.h"
+#include "prdp/steppers/rollout_loops.h"
 
 namespace prdp {
 
