@@ -31,7 +31,7 @@ void AdjointIdentity::keep(const at::Tensor& b, const Solved& solved) {
 }
 
 void AdjointIdentity::check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint,
-                            const FunctionCode* code) const {
+                            FunctionCode& code) const {
   if (writes_to(b_, u_) != writes_) return;
   const at::NoGradGuard no_grad;
   const auto forward_size = sample_norms(lambda) * sample_norms(b_),

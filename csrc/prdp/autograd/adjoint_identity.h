@@ -13,8 +13,7 @@ class AdjointIdentity {
   void keep(const at::Tensor& b, const Solved& solved);
   /// Warns, once for this `code`, of the first sample where the two differ by more than both residuals explain. Says
   /// nothing where b or u was written to since, or the adjoint solve failed.
-  void check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint,
-             const FunctionCode* code) const;
+  void check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint, FunctionCode& code) const;
   bool has_kept() const { return b_.defined(); }
   void release() { b_ = u_ = residual_ = at::Tensor(); }
 

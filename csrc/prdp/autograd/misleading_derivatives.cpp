@@ -1,5 +1,7 @@
 #include "prdp/autograd/misleading_derivatives.h"
 
+#include <ATen/core/grad_mode.h>
+
 #include <algorithm>
 #include <cmath>
 

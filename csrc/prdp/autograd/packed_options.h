@@ -3,7 +3,6 @@
 #include <bit>
 #include <optional>
 #include <string>
-#include <tuple>
 #include <utility>
 #include <vector>
 

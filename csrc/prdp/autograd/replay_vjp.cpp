@@ -1,8 +1,9 @@
-#include <torch/csrc/autograd/autograd.h>
+#include <algorithm>
 
 #include "prdp/autograd/stored_iterates.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/operators/with_autograd.h"
 #include "prdp/solvers/solve_recorded.h"
 
 namespace prdp {
@@ -37,50 +38,44 @@ class Replay {
 
   /// Records iteration k alone, from leaves: the state before it, and the inputs.
   void step_back(int64_t slot, int64_t k) {
-    std::vector<at::Tensor> leaves, inputs = inputs_;
+    std::vector<at::Tensor> inputs = inputs_;
     State before = kept_[slot];
-    for (auto& part : before) leaves.push_back(part = part.detach().requires_grad_());
-    for (size_t i = 0; i < inputs.size(); ++i)
-      if (is_differentiated(i)) leaves.push_back(inputs[i] = inputs[i].detach().requires_grad_());
-    std::vector<at::Tensor> outputs, cotangents;
+    for (auto& part : before) part = part.detach().requires_grad_();
+    std::vector<int64_t> wanted(before.size(), 1);
+    for (size_t i = 0; i < inputs.size(); ++i) {
+      wanted.push_back(needed_[i] || i == 0);  // the right-hand side always: finish() takes its cotangent to those of A
+      if (wanted.back()) inputs[i] = inputs[i].detach().requires_grad_();
+    }
     const auto found = with_autograd([&] {
       const auto a = make_({inputs.begin() + 1, inputs.end()});
       const auto after = solve_.step(*a, inputs[0], before, k);
       if (bars_.empty()) bars_.push_back(solve_.scaled_back(*make_(tensors()), cotangent_));
-      for (size_t i = 0; i < bars_.size(); ++i) {
-        if (!bars_[i].defined() || !after[i].requires_grad()) continue;
-        outputs.push_back(after[i]);
-        cotangents.push_back(bars_[i]);
-      }
-      return torch::autograd::grad(outputs, leaves, cotangents, false, false, /*allow_unused=*/true);
+      bars_.resize(after.size());  // after the last iteration, x alone has one
+      auto leaves = before;
+      leaves.insert(leaves.end(), inputs.begin(), inputs.end());
+      return gradients_of(after, bars_, leaves, wanted);
     });
     bars_.assign(found.begin(), found.begin() + before.size());
-    for (size_t i = 0, next = before.size(); i < inputs.size(); ++i)
-      if (is_differentiated(i)) add_to(gradients[i], found[next++]);
+    for (size_t i = 0; i < inputs.size(); ++i) add_to(gradients[i], found[before.size() + i]);
   }
 
   /// From the cotangent of the right-hand side, b - A start, to those of b and A.
   void finish() {
     gradients[0] = solve_.bar_of_b(*make_(tensors()), gradients[0]);
     if (!solve_.start().defined()) return;
-    std::vector<at::Tensor> inputs = tensors(), leaves;
+    const auto of_tensors = needed_.slice(1);
+    if (std::count(of_tensors.begin(), of_tensors.end(), 0) == std::ssize(of_tensors)) return;
+    std::vector<at::Tensor> inputs = tensors();
     for (size_t i = 0; i < inputs.size(); ++i)
-      if (needed_[i + 1]) leaves.push_back(inputs[i] = inputs[i].detach().requires_grad_());
-    if (leaves.empty()) return;
-    const auto found = with_autograd([&] {
-      const auto product = make_(inputs)->apply(solve_.start());
-      if (!product.requires_grad()) return std::vector<at::Tensor>(leaves.size());
-      return torch::autograd::grad({product}, leaves, {gradients[0].neg()}, false, false, /*allow_unused=*/true);
-    });
-    for (size_t i = 0, next = 0; i < inputs.size(); ++i)
-      if (needed_[i + 1]) add_to(gradients[i + 1], found[next++]);
+      if (of_tensors[i]) inputs[i] = inputs[i].detach().requires_grad_();
+    const auto found = with_autograd(
+        [&] { return gradients_of({make_(inputs)->apply(solve_.start())}, {gradients[0].neg()}, inputs, of_tensors); });
+    for (size_t i = 0; i < inputs.size(); ++i) add_to(gradients[i + 1], found[i]);
   }
 
   std::vector<at::Tensor> gradients;  // of the right-hand side and the tensors of A
 
  private:
-  /// The right-hand side always: finish() takes its cotangent to those of A.
-  bool is_differentiated(size_t input) const { return needed_[input] || input == 0; }
   std::vector<at::Tensor> tensors() const { return {inputs_.begin() + 1, inputs_.end()}; }
 
   MakeOperator make_;

@@ -82,7 +82,7 @@ variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& so
   auto with_lambda = needed;
   with_lambda[0] = 1;
   auto found = vjp(with_lambda);
-  identity.check(cotangent, found.gradients[0], found.info, products_->code.get());
+  identity.check(cotangent, found.gradients[0], found.info, *products_->code);
   if (!needed[0]) found.gradients[0] = at::Tensor();
   return std::move(found.gradients);
 }

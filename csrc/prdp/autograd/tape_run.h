@@ -137,7 +137,7 @@ class TapeRun {
     bool holds;
     T number;
   };
-  /// A state as versions and nodes; at each place one of the two.
+  /// A state; entry i is a vector's version or a number's node, and the other array is unused there.
   struct Parts {
     std::array<Vector, kVectors + kNumbers> vectors;
     std::array<Number, kVectors + kNumbers> numbers;

@@ -108,7 +108,7 @@ void reverse_samples(const kernels::KernelBatch<T>& a, const kernels::KernelBatc
     }
     const int64_t length = own->length(), halo = own->layout().halo;
     if (!memory) memory.emplace(ThreadMemory<T>{kernels::Workspace<T>::local(), {length, halo}, {length, halo}});
-    // Nothing may be left of a sample before that was not finite.
+    // The sample before may have left NaN in the workspace.
     memory->workspace.prepare(SampleSpace<T>::vectors(batch.x0 != nullptr), length, halo);
     reverse_sample(pair, *memory, batch, s);
   }

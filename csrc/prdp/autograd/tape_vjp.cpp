@@ -3,6 +3,7 @@
 #include "prdp/autograd/tape_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/operators/with_autograd.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/threads/share_samples.h"

@@ -9,6 +9,7 @@
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/error_text.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/with_autograd.h"
 
 namespace prdp {
 

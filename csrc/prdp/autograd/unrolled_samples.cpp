@@ -10,7 +10,6 @@
 #include "prdp/autograd/solved_to_rounding.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/methods.h"
 #include "prdp/solvers/report_failures.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/solvers/verdicts.h"
@@ -229,7 +228,9 @@ class SampleVjps {
       if (found_.finite[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
     auto info = info_of(found_.outcomes, solved_.b.scalar_type());
     if (options_.adjoint_log != 0) adjoint_log::write(options_.adjoint_log, info);
-    report_failures({spec_, options_.solver, /*adjoint=*/true}, *a_, cotangent_,
+    auto transpose = spec_;
+    transpose.transposed = !spec_.transposed;
+    report_failures({transpose, options_.solver, /*adjoint=*/true}, *make_operator(transpose), cotangent_,
                     info_of(failures, solved_.b.scalar_type()), options_.on_failure);
     for (auto* part : info.parts()) *part = part->to(solved_.b.device());
     return info;

@@ -4,7 +4,6 @@
 #include <vector>
 
 #include "prdp/autograd/solve_vjp.h"
-#include "prdp/operators/with_autograd.h"
 
 namespace prdp {
 
@@ -13,13 +12,15 @@ namespace prdp {
 ///   its cotangent or its gradient is not finite     fails with NONFINITE_INPUT or OVERFLOW
 ///   solved to rounding                              gets the implicit derivative, because its last iterations, or
 ///                                                   those that it no longer needed, say nothing about that of u
-///   solved by a method that is no polynomial in A, but b̄ or Ā is further from the implicit one than zero is
+///   solved by a method that is no polynomial in A, but b̄ or Ā is too far from the implicit one
 ///                                                   the same: b excites few eigenvectors, and the derivative of the
-///                                                   iterations is one in those directions alone, or rounding
+///                                                   iterations is one in those directions alone, or rounding; or
+///                                                   a recurrence, such as BiCGStab's, came near a breakdown
 ///   failed, with on_failure="zero_grad"             get none
 ///   all others                                      get the derivative of exactly their iterations
 /// The report of a sample with the implicit derivative is that of its adjoint solve. For the last kind it has the
 /// iterations and the status of the forward solve, and NaN as residual, because no system is solved.
+/// What is too far, misleading_derivatives.h says.
 SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
                       const SolveOptions& options, at::IntArrayRef needed);
 

@@ -2,6 +2,7 @@
 #include <torch/csrc/autograd/autograd.h>
 #include <torch/library.h>
 
+#include <algorithm>
 #include <limits>
 
 #include "prdp/autograd/op_results.h"

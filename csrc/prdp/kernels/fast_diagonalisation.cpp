@@ -1,5 +1,6 @@
 #include "prdp/kernels/fast_diagonalisation.h"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <numbers>

@@ -1,4 +1,5 @@
 #pragma once
+#include <algorithm>
 #include <numeric>
 
 #include "prdp/kernels/assembly.h"

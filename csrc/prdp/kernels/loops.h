@@ -1,6 +1,5 @@
 #pragma once
 #include <cstdint>
-#include <string_view>
 
 #include "prdp/kernels/stencil_sparsity.h"
 

@@ -1,6 +1,7 @@
 #pragma once
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 #include <utility>
 #include <vector>
 
@@ -88,13 +89,14 @@ class Dense final : public MatrixKernel<T> {
     });
   }
   double norm() const override {
-    double largest = 0;
+    std::vector<double> sums(n(), 0.0);  // of the rows of the matrix as applied
     for (int64_t i = 0; i < n(); ++i) {
-      double sum = 0;
-      for (int64_t j = 0; j < n(); ++j) sum += std::abs(a_[i * n() + j]);
-      largest = std::max(largest, sum);
+      const T* row = a_ + i * n();
+      if (transposed_)
+        for (int64_t j = 0; j < n(); ++j) sums[j] += std::abs(row[j]);
+      else sums[i] = std::accumulate(row, row + n(), 0.0, [](double sum, T a) { return sum + std::abs(a); });
     }
-    return largest;
+    return std::accumulate(sums.begin(), sums.end(), 0.0, [](double a, double b) { return std::max(a, b); });
   }
   std::shared_ptr<const Factors<T>> factorise() const override;
 

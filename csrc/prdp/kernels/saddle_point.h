@@ -1,6 +1,5 @@
 #pragma once
 #include <memory>
-#include <vector>
 
 #include "prdp/kernels/assembly.h"
 #include "prdp/kernels/multigrid.h"

@@ -43,6 +43,11 @@ at::Tensor AdvectionDiffusion::diagonal() const {
   return alpha_ + beta_ * sum;
 }
 
+at::Tensor AdvectionDiffusion::column_norms() const {
+  const auto d = diagonal();
+  return 2.0 * d - apply_transpose(at::ones_like(d));
+}
+
 at::Tensor AdvectionDiffusion::coefficients() const {
   std::vector<at::Tensor> all{diagonal()};
   for (int64_t d = 0; d < grid_.dim(); ++d) {

@@ -25,6 +25,8 @@ class AdvectionDiffusion {
   at::Tensor coefficients() const;
   /// Σ_j |C_ij|, as the diagonal.
   at::Tensor row_norms() const { return 2.0 * diagonal() - alpha_; }
+  /// Σ_i |C_ij|, in the same way: only the diagonal is positive.
+  at::Tensor column_norms() const;
 
   /// ∂⟨λ, C u⟩ with respect to the winds and nu; λ and u (batch, channel, *shape), the winds' batch
   /// that of u.

@@ -19,6 +19,7 @@ class BurgersOperator final : public UpwindOperator {
   at::Tensor apply_transpose(const at::Tensor& v) const override { return block().apply_transpose(v); }
   at::Tensor diagonal() const override { return block().diagonal(); }
   at::Tensor norm() const override { return largest(block().row_norms()); }
+  at::Tensor norm_of_transpose() const override { return largest(block().column_norms()); }
   at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;

@@ -113,10 +113,14 @@ at::Tensor CsrOperator::diagonal() const {
   return at::zeros(shape, values_.options()).scatter_add(-1, row, on_diagonal);
 }
 
-at::Tensor CsrOperator::norm() const {
+at::Tensor CsrOperator::norm() const { return largest_sum(rows()); }
+
+at::Tensor CsrOperator::norm_of_transpose() const { return largest_sum(col_); }
+
+at::Tensor CsrOperator::largest_sum(const at::Tensor& of_entries) const {
   auto shape = values_.sizes().vec();
   shape.back() = n();
-  return at::zeros(shape, values_.options()).scatter_add(-1, rows(), values_.abs()).amax(-1);
+  return at::zeros(shape, values_.options()).scatter_add(-1, of_entries, values_.abs()).amax(-1);
 }
 
 at::Tensor CsrOperator::to_dense() const {

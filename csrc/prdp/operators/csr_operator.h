@@ -20,6 +20,7 @@ class CsrOperator final : public Operator {
   at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor norm() const override;
+  at::Tensor norm_of_transpose() const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {n()}; }
@@ -32,6 +33,8 @@ class CsrOperator final : public Operator {
   /// The row of each stored entry, which is kept: products ask for it again and again.
   at::Tensor rows() const;
   at::Tensor to_dense() const;
+  /// The largest sum of magnitudes of the entries that share a row, or a column: which one `of_entries` says.
+  at::Tensor largest_sum(const at::Tensor& of_entries) const;
   void drop_axis_of_one();
 
   at::Tensor crow_, col_, values_;  // (…) or (batch, …)

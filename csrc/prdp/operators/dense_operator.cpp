@@ -53,6 +53,8 @@ at::Tensor DenseOperator::apply_transpose(const at::Tensor& v) const { return ma
 at::Tensor DenseOperator::diagonal() const { return matrix_.diagonal(0, -2, -1); }
 at::Tensor DenseOperator::norm() const { return matrix_.abs().sum(-1).amax(-1); }
 
+at::Tensor DenseOperator::norm_of_transpose() const { return matrix_.abs().sum(-2).amax(-1); }
+
 at::Tensor DenseOperator::solve_directly(const at::Tensor& b, bool transposed) const {
   // A singular matrix gives numbers that are not finite; TensorSpace::solve_directly() calls that a breakdown.
   return solve_dense(transposed ? matrix_.mT() : matrix_, b.unsqueeze(-1)).squeeze(-1);

@@ -15,6 +15,7 @@ class DenseOperator final : public Operator {
   at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor norm() const override;
+  at::Tensor norm_of_transpose() const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {matrix_.size(-1)}; }

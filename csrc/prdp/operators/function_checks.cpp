@@ -40,8 +40,8 @@ void check_multiples(const Operator& a, const at::Tensor& b) {
                     in_language("torch.func.jvp", "forward-mode autograd"), " makes it");
 }
 
-/// Raises ValueError where A v of some sample changes with the sign of v in another one, by more than a product by
-/// differences does, whose step may be that of the whole batch, and by more than from one call to the next.
+/// Raises ValueError if flipping the sign of v in one sample changes A v in another. Allowed are the error of a product
+/// by finite differences, whose step may depend on the whole batch, and the difference between two equal calls.
 void check_samples_are_apart(const Operator& a, const at::Tensor& b) {
   if (b.size(0) < 2) return;
   const auto v = scale_finite_samples(b, b.abs().flatten(1).amax(1)).v;

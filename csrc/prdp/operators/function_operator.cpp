@@ -195,7 +195,7 @@ at::Tensor FunctionOperator::solve_directly(const at::Tensor& b, bool transposed
   const auto product = [&](const at::Tensor& v) { return transposed ? apply_transpose(v) : apply(v); };
   check_dense_fits(b, b.numel() / std::max<int64_t>(b.size(0), 1), b.size(0));
   const auto matrix = matrix_by_columns(product, b);
-  norm_of_matrix_ = matrix.detach().abs().sum(transposed ? -2 : -1).amax(-1).to(at::kDouble);
+  norms_of_matrix_[transposed] = matrix.detach().abs().sum(-1).amax(-1).to(at::kDouble);
   return solve(matrix, b);
 }
 
@@ -206,24 +206,17 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
   // the partial derivative must not follow a tensor's way through u.
   const bool create_graph = at::GradMode::is_enabled();
   return with_autograd([&] {
-    std::vector<at::Tensor> arguments, wanted;
+    std::vector<at::Tensor> arguments;
+    std::vector<int64_t> wanted;
     for (const auto& t : tensors_) {
       const bool recorded = create_graph && t.requires_grad();
       arguments.push_back(recorded ? t.view_as(t) : holds_numbers(t) ? t.detach().requires_grad_() : t);
-      if (arguments.back().requires_grad()) wanted.push_back(arguments.back());
+      wanted.push_back(arguments.back().requires_grad());
     }
-    std::vector<at::Tensor> gradients(tensors_.size());
-    if (wanted.empty()) return gradients;
+    if (std::find(wanted.begin(), wanted.end(), 1) == wanted.end()) return std::vector<at::Tensor>(tensors_.size());
     const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, product_name());
-    if (!made.requires_grad()) {
-      check_is_recorded(u);
-      return gradients;
-    }
-    const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()}, create_graph,
-                                             create_graph, /*allow_unused=*/true);
-    for (size_t i = 0, next = 0; i < tensors_.size(); ++i)
-      if (arguments[i].requires_grad()) gradients[i] = found[next++];
-    return gradients;
+    if (!made.requires_grad()) check_is_recorded(u);
+    return gradients_of({made}, {create_graph ? lambda : lambda.detach()}, arguments, wanted, create_graph);
   });
 }
 
@@ -235,8 +228,12 @@ void FunctionOperator::check_is_recorded(const at::Tensor& u) const {
                     in_language("numpy and torch.no_grad()", "NoGradGuard"), ", or detach its tensors");
 }
 
-at::Tensor FunctionOperator::norm() const {
-  if (norm_of_matrix_.defined()) return norm_of_matrix_;
+at::Tensor FunctionOperator::norm() const { return norm_of(/*transposed=*/false); }
+
+at::Tensor FunctionOperator::norm_of_transpose() const { return norm_of(/*transposed=*/true); }
+
+at::Tensor FunctionOperator::norm_of(bool transposed) const {
+  if (norms_of_matrix_[transposed].defined()) return norms_of_matrix_[transposed];
   auto norm = at::scalar_tensor(0.0, at::kDouble);
   for (const auto& t : tensors_)
     if (holds_numbers(t))

@@ -21,6 +21,7 @@ class FunctionOperator final : public Operator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   /// Not known before an exact solve: 0, or NaN if a tensor is not finite.
   at::Tensor norm() const override;
+  at::Tensor norm_of_transpose() const override;
   /// The samples whose product with a vector of ones is not finite, if a tensor is not; all if no product is.
   at::Tensor nonfinite_samples(const at::Tensor& b) const override;
   bool may_be_singular() const override { return static_cast<bool>(registered_->products().apply_transpose); }
@@ -36,6 +37,7 @@ class FunctionOperator final : public Operator {
                      const char* name) const;
   at::Tensor product_without_captures(const at::Tensor& v) const;
   at::Tensor derivative_transposed(const at::Tensor& v) const;
+  at::Tensor norm_of(bool transposed) const;
   /// Raises ValueError where autograd does not follow `apply`, so that no tensor could have a gradient.
   void check_is_recorded(const at::Tensor& u) const;
 
@@ -47,7 +49,7 @@ class FunctionOperator final : public Operator {
   };
   mutable std::optional<Recorded> recorded_;
   mutable bool looked_in_inference_ = false;  // for writes, which no tensor counts there
-  mutable at::Tensor norm_of_matrix_;         // (batch,), once it has been made
+  mutable at::Tensor norms_of_matrix_[2];     // (batch,) of A and of Aᵀ, once that has been made
   mutable std::vector<int64_t> vectors_;  // shape of the right-hand side; empty: not known
 };
 

@@ -77,9 +77,18 @@ at::Tensor NavierStokesOperator::diagonal() const {
 
 at::Tensor NavierStokesOperator::norm() const {
   const auto& [c1, c2] = momentum();
+  return norm_of(c1.row_norms(), c2.row_norms());
+}
+
+at::Tensor NavierStokesOperator::norm_of_transpose() const {
+  const auto& [c1, c2] = momentum();
+  return norm_of(c1.column_norms(), c2.column_norms());  // G = -Dᵀ
+}
+
+at::Tensor NavierStokesOperator::norm_of(const at::Tensor& of_c1, const at::Tensor& of_c2) const {
   const double x = 2.0 / grid_.dx(kX), y = 2.0 / grid_.dx(kY);  // the rows of G₁ and G₂
-  const auto n1 = c1.row_norms() + x;
-  return largest(at::cat({n1, c2.row_norms() + y, at::full_like(n1, x + y)}, 1));
+  const auto n1 = of_c1 + x;
+  return largest(at::cat({n1, of_c2 + y, at::full_like(n1, x + y)}, 1));
 }
 
 std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {

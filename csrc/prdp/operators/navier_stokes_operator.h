@@ -28,6 +28,7 @@ class NavierStokesOperator final : public UpwindOperator {
   at::Tensor apply_transpose(const at::Tensor& v) const override;
   at::Tensor diagonal() const override;
   at::Tensor norm() const override;
+  at::Tensor norm_of_transpose() const override;
   /// v with its mean pressure taken off.
   at::Tensor project(const at::Tensor& v) const override { return without_mean_pressure(v); }
   /// The solution of least norm to the projected right-hand side.
@@ -46,6 +47,8 @@ class NavierStokesOperator final : public UpwindOperator {
   const Momentum& momentum() const;
   /// (C₁u₁ + s G₁p, C₂u₂ + s G₂p, s (D₁u₁ + D₂u₂)) out of C₁u₁, C₂u₂ and v = (u₁, u₂, p).
   at::Tensor couple(const at::Tensor& c1_u1, const at::Tensor& c2_u2, double s, const at::Tensor& v) const;
+  /// The norm of A, or of Aᵀ, from the sums of magnitudes in the rows of C₁ and C₂, or in their columns.
+  at::Tensor norm_of(const at::Tensor& of_c1, const at::Tensor& of_c2) const;
   /// A plus the mean of the pressure in each of its rows, (batch or 1, n, n).
   at::Tensor regular_matrix() const;
 

@@ -1,5 +1,8 @@
 #include <ATen/core/grad_mode.h>
 
+#include <limits>
+#include <variant>
+
 #include "prdp/error_text.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
@@ -65,7 +68,7 @@ void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Ten
   const auto vectors = q / q.abs().amax(1, /*keepdim=*/true);
   const bool spans_channels = basis.spans_channels(b);
   const double rounding = 200.0 * epsilon_of(b);
-  // The largest entry of a product where it is more than rounding. What is not finite, its status says.
+  // The largest entry of a product: 0 where it is rounding or not finite; the sample's status reports the latter.
   const auto largest_of = [&](const at::Tensor& vector) {
     const auto v = in_each_channel(vector, by_vector(b, spans_channels)).reshape_as(b);
     const auto left = sample_maxima(apply_on_loops(*a_, v, transposed));

@@ -60,7 +60,8 @@ class Transposed final : public Operator {
   bool may_be_singular() const override { return a_->may_be_singular(); }
   at::Tensor jacobi_radius() const override { return a_->jacobi_radius(); }
   bool knows_jacobi_radius() const override { return a_->knows_jacobi_radius(); }
-  at::Tensor norm() const override { return a_->norm(); }
+  at::Tensor norm() const override { return a_->norm_of_transpose(); }
+  at::Tensor norm_of_transpose() const override { return a_->norm(); }
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
   at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override {
     return a_->solve_directly(b, !transposed);

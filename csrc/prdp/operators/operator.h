@@ -61,6 +61,8 @@ class Operator {
   virtual at::Tensor solve_directly(const at::Tensor& b, bool transposed) const = 0;
   /// ‖A‖∞: one value, or one per sample. 0 where it is not known, as of a Function; not finite where A is not.
   virtual at::Tensor norm() const = 0;
+  /// ‖Aᵀ‖∞ in the same way.
+  virtual at::Tensor norm_of_transpose() const { return norm(); }  // of a symmetric A, or where it is not known
   /// ρ, the spectral radius of I - D⁻¹A, whose eigenvalues come in pairs ±μ. Differentiable in the tensors of A. Raises
   /// ValueError if it is not known.
   virtual at::Tensor jacobi_radius() const;

@@ -46,6 +46,7 @@ class SingularOperator final : public Operator {
   }
   at::Tensor diagonal() const override { return a_->diagonal(); }
   at::Tensor norm() const override { return a_->norm(); }
+  at::Tensor norm_of_transpose() const override { return a_->norm_of_transpose(); }
   at::Tensor project(const at::Tensor& v) const override { return without(left_, v); }
   at::Tensor project_solution(const at::Tensor& v) const override { return without(right_, v); }
   bool needs_projection() const override { return true; }

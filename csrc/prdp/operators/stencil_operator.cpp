@@ -63,7 +63,11 @@ at::Tensor StencilOperator::diagonal() const {
   return sum.defined() ? sum : at::zeros_like(coefficient(0));
 }
 
-at::Tensor StencilOperator::norm() const {
+at::Tensor StencilOperator::norm() const { return norm_of(/*transposed=*/false); }
+
+at::Tensor StencilOperator::norm_of_transpose() const { return norm_of(/*transposed=*/true); }
+
+at::Tensor StencilOperator::norm_of(bool transposed) const {
   const kernels::StencilSparsity pattern(grid_, offsets_);
   const auto inside = at::ones(coefficients_.sizes().slice(2), coefficients_.options());
   std::vector<at::Tensor> entries(pattern.offsets.size());
@@ -71,8 +75,11 @@ at::Tensor StencilOperator::norm() const {
   for (int64_t k = 0; k < count(); ++k)
     if (const int64_t place = pattern.places[k]; place >= 0)
       add_to(entries[place], coefficient(k).squeeze(1) * shifted(inside, offsets_[k]));
-  for (const auto& entry : entries)
-    if (entry.defined()) rows = rows + entry.abs();
+  for (size_t place = 0; place < entries.size(); ++place) {
+    if (!entries[place].defined()) continue;
+    const auto size = entries[place].abs();
+    rows = rows + (transposed ? shifted(size, pattern.offsets[place], /*back=*/true) : size);
+  }
   const auto norms = rows.flatten(1).amax(1);
   return norms.size(0) == 1 ? norms.squeeze(0) : norms;
 }

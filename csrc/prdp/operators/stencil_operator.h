@@ -30,6 +30,7 @@ class StencilOperator final : public Operator {
   at::Tensor apply_transpose(const at::Tensor& v) const override;
   at::Tensor diagonal() const override;
   at::Tensor norm() const override;
+  at::Tensor norm_of_transpose() const override;
   at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
@@ -54,6 +55,7 @@ class StencilOperator final : public Operator {
  private:
   std::shared_ptr<const kernels::Kernels> kernels_of(const at::Tensor& b, bool transposed,
                                                      const at::Tensor& row_sums) const;
+  at::Tensor norm_of(bool transposed) const;
   int64_t dim() const { return grid_.dim; }
   int64_t count() const { return static_cast<int64_t>(offsets_.size()); }
   /// The index of an axis among (z, y, x): the last dim() of them are this operator's.

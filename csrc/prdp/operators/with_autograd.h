@@ -1,6 +1,9 @@
 #pragma once
 #include <ATen/ATen.h>
 #include <ATen/core/grad_mode.h>
+#include <torch/csrc/autograd/autograd.h>
+
+#include <vector>
 
 namespace prdp {
 
@@ -13,6 +16,27 @@ auto with_autograd(const Body& body) {
                                                keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
   const at::AutoGradMode record(true);
   return body();
+}
+
+/// grad() of torch: a gradient in the place of each input, undefined where `needed` holds 0 or there is none. Outputs
+/// without a gradient or a cotangent contribute nothing.
+inline std::vector<at::Tensor> gradients_of(const std::vector<at::Tensor>& outputs,
+                                            const std::vector<at::Tensor>& cotangents,
+                                            const std::vector<at::Tensor>& inputs, at::IntArrayRef needed,
+                                            bool create_graph = false) {
+  std::vector<at::Tensor> of, bars, wanted, all(inputs.size());
+  for (size_t i = 0; i < outputs.size(); ++i)
+    if (outputs[i].defined() && outputs[i].requires_grad() && cotangents[i].defined()) {
+      of.push_back(outputs[i]);
+      bars.push_back(cotangents[i]);
+    }
+  for (size_t i = 0; i < inputs.size(); ++i)
+    if (needed[i]) wanted.push_back(inputs[i]);
+  if (of.empty() || wanted.empty()) return all;
+  const auto found = torch::autograd::grad(of, wanted, bars, create_graph, create_graph, /*allow_unused=*/true);
+  for (size_t i = 0, next = 0; i < inputs.size(); ++i)
+    if (needed[i]) all[i] = found[next++];
+  return all;
 }
 
 }  // namespace prdp

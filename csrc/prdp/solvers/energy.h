@@ -14,8 +14,8 @@ struct InnerProducts {
 
 /// Whether the iterates of a method for definite operators do what they are made for: A is symmetric, judged by x·A r
 /// and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the norm of A, which
-/// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, or x·A x is the rounding of
-/// A x, x lies almost in the null space of A, and says nothing, unless A has none for sure.
+/// is (x·b)² > (x·r)² for a definite A of either sign. If x·b and x·r agree up to rounding, or x·A x is rounding, x may
+/// lie in the null space, and the test fails; the second case does not count where A is known to be definite.
 inline bool energy_falls(const InnerProducts& e, double epsilon, bool surely_definite) {
   constexpr double roundings = 2e3;  // of a product of vectors, with much to spare
   const auto clamped = [](double v) { return std::max(v, 0.0); };

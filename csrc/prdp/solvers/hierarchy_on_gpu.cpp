@@ -1,7 +1,5 @@
 #include "prdp/solvers/hierarchy_on_gpu.h"
 
-#include <ATen/Parallel.h>
-
 #include <algorithm>
 #include <limits>
 #include <sstream>
@@ -100,7 +98,7 @@ at::Tensor make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b) {
 }
 
 CycleMemory memory_of_cycle(const at::Tensor& b) {
-  constexpr int64_t vectors = 3;
+  constexpr int64_t vectors = 3;  // b, x and y of a coarse grid; kVectorsOfCycle are x, y and spare of the finest
   auto shape = b.sizes().slice(2).vec();
   int64_t usual = 0;
   const auto is_long = [](int64_t n) { return n > kernels::kCoarsest; };

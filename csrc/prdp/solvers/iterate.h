@@ -120,7 +120,7 @@ void accept_if_insensitive(Space& space, const Method& method, typename Space::S
 
 /// For direct methods, where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖, and the residual exceeds 1e-2 ‖b‖: if the
 /// rounding of A may move u, A is singular to the dtype, and zero replaces u; else u is as good as the dtype allows,
-/// and its residual is rounding. A residual above ‖b‖ is else a breakdown.
+/// and its residual is rounding. Any other residual above ‖b‖ is a breakdown.
 template <class Space, class Method>
 void judge_numerical_singularity(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };

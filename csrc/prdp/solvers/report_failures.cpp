@@ -57,6 +57,12 @@ std::string key_of(const SolveRole& role) {
 /// Residuals above this are reported.
 double warning_threshold(double rtol) { return std::max(10.0 * rtol, 0.01); }
 
+/// The one of these samples with the largest residual.
+int64_t worst_of(const std::vector<int64_t>& samples, const std::vector<double>& residual) {
+  return *std::max_element(samples.begin(), samples.end(),
+                           [&](int64_t i, int64_t j) { return residual[i] < residual[j]; });
+}
+
 /// Warns of samples whose residual stopped far above what was asked for, and returns whether there are any. That is no
 /// failure: the residual may be all that rounding leaves of a u that is good enough, but nobody else would say that it
 /// may not be.
@@ -64,11 +70,9 @@ bool warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tens
                         const std::vector<int64_t>& stagnated) {
   if (stagnated.empty()) return false;
   // Where the two are equal, u consists of the least numbers of its dtype, and the residual of their rounding.
-  const auto residuals = info.residual.masked_fill(info.residual.eq(info.floor), 0.0).to(at::kCPU, at::kDouble);
-  const auto* residual = residuals.const_data_ptr<double>();
+  const auto residual = to_host<double>(info.residual.masked_fill(info.residual.eq(info.floor), 0.0), b.size(0));
   const double bound = warning_threshold(role.solver.rtol);
-  const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
-  const int64_t worst = *std::max_element(stagnated.begin(), stagnated.end(), worse);
+  const int64_t worst = worst_of(stagnated, residual);
   if (!(residual[worst] > bound)) return false;
   const auto many = std::count_if(stagnated.begin(), stagnated.end(), [&](int64_t i) { return residual[i] > bound; });
   warn_once(key_of(role), residual[worst], [&](std::ostream& text) {
@@ -109,18 +113,13 @@ bool later_iterations_were_worse(const Solver& solver, SolveStatus status, int64
 /// residual grows, but whoever asked for a tolerance did not mean it. Returns whether there are any.
 bool warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& b, const std::vector<int64_t>& status,
                     const std::vector<double>& residual) {
-  const auto has_grown = [&](int64_t i) {
-    return static_cast<SolveStatus>(status[i]) == SolveStatus::kMaxIter && residual[i] > 1.0;
-  };
-  int64_t many = 0, worst = -1;
-  for (int64_t i = 0; i < b.size(0); ++i) {
-    if (!has_grown(i)) continue;
-    ++many;
-    if (worst < 0 || residual[i] > residual[worst]) worst = i;
-  }
-  if (many == 0) return false;
+  std::vector<int64_t> grown;
+  for (int64_t i = 0; i < b.size(0); ++i)
+    if (static_cast<SolveStatus>(status[i]) == SolveStatus::kMaxIter && residual[i] > 1.0) grown.push_back(i);
+  if (grown.empty()) return false;
+  const int64_t worst = worst_of(grown, residual);
   warn_once("grown: " + key_of(role), residual[worst], [&](std::ostream& text) {
-    text << name_of(role) << ": " << many << " of " << b.size(0)
+    text << name_of(role) << ": " << grown.size() << " of " << b.size(0)
          << " samples stopped at max_iter = " << role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
          << " at " << residual[worst] << ", where rtol = " << role.solver.rtol << " was asked for, "
          << diagnosis(role, a, b, SolveStatus::kMaxIter, worst) << "; or rtol=0 if this is meant";
@@ -146,8 +145,7 @@ void warn_of_unfit(const SolveRole& role, const Operator& a, const at::Tensor& b
   if (!should_look(key_of(role))) return;
   const auto residual = to_host<double>(info.residual, b.size(0)), floor = to_host<double>(info.floor, b.size(0));
   const auto products = to_host<int64_t>(info.operator_applications, b.size(0));
-  const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
-  const int64_t worst = *std::max_element(unsolved.begin(), unsolved.end(), worse);
+  const int64_t worst = worst_of(unsolved, residual);
   const double bound = 10.0 * std::max(s.rtol, floor[worst]);
   if (static_cast<double>(products[worst]) < many || !(residual[worst] > bound)) return;
   if (unfit(role, a, b, worst).empty()) return;
@@ -240,15 +238,16 @@ void warn_of_constant_cycles() {
   });
 }
 
-void warn_of_another_transpose(const void* code, int64_t sample, double of_solve, double of_adjoint) {
-  warn_once(c10::str("another transpose ", code), 0.0, [&](std::ostream& text) {
-    text << "adjoint solve: the gradient of sample " << sample
-         << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
-         << " and ⟨u, ū⟩ = " << of_adjoint << " should be equal. Is "
-         << in_language("`transpose` right, or A symmetric where symmetric=True", "`apply_transpose` right")
-         << "? Do the functions still see the tensors that they captured?"
-         << in_language(" prdp.check_operator tells", "");
-  });
+void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_solve, double of_adjoint) {
+  if (code.warned_of_transpose.exchange(true) && !c10::WarningUtils::get_warnAlways()) return;
+  std::ostringstream text;
+  text << "adjoint solve: the gradient of sample " << sample
+       << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
+       << " and ⟨u, ū⟩ = " << of_adjoint << " should be equal. Is "
+       << in_language("`transpose` right, or A symmetric where symmetric=True", "`apply_transpose` right")
+       << "? Do the functions still see the tensors that they captured?"
+       << in_language(" prdp.check_operator tells", "");
+  warn_this_once(text.str(), /*may_get_worse=*/false);
 }
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/operators/operator.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/solvers/solver.h"
 
 /// What is said of solves: errors for failed samples, and warnings where a result may mislead.
@@ -14,15 +15,17 @@ struct SolveRole {
 };
 
 /// Raises c10::LinAlgError, warns or does nothing about failed samples, as `on_failure` says. The message names the
-/// samples, the operator, the cause and a remedy (failure_messages.h). Where none failed, it warns once of samples that
-/// stagnated far above rtol, unless nobody wants to hear of failures.
+/// samples, the operator, the cause and a remedy (failure_messages.h). If none failed, it warns once of samples that
+/// ended far from rtol. kReturn and kZeroGrad only warn of cotangents that are not finite, where the status is on the
+/// CPU.
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure);
 
 /// Says once that an unrolled gradient of A takes the cycles of multigrid for constants.
 void warn_of_constant_cycles();
 
-/// Warns that ⟨λ, b⟩ and ⟨u, ū⟩ of a sample differ, so that a Function's adjoint solve was made with another A.
-void warn_of_another_transpose(const void* code, int64_t sample, double of_solve, double of_adjoint);
+/// Warns that ⟨λ, b⟩ and ⟨u, ū⟩ of a sample differ, so that a Function's adjoint solve was made with another A: once
+/// for this `code`.
+void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_solve, double of_adjoint);
 
 }  // namespace prdp

@@ -24,10 +24,9 @@ thread_local std::optional<Way> last_way;
 /// Past the dispatcher: small solves take no longer than a few of its calls.
 at::Tensor empty(at::IntArrayRef sizes, at::ScalarType dtype) { return at::detail::empty_cpu(sizes, dtype); }
 
-SolveInfo empty_info(const at::Tensor& b) {
-  const int64_t batch = b.size(0);
-  return {empty(batch, at::kLong), empty(batch, b.scalar_type()), empty(batch, at::kLong), empty(batch, at::kLong),
-          empty(batch, b.scalar_type())};
+SolveInfo empty_info(int64_t batch, at::ScalarType real) {
+  return {empty(batch, at::kLong), empty(batch, real), empty(batch, at::kLong), empty(batch, at::kLong),
+          empty(batch, real)};
 }
 
 /// Whether this solver runs in the CPU loops, if the operator has any.
@@ -38,7 +37,7 @@ template <class T>
 SolveResult solve_samples_of(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>* shared, const at::Tensor& b,
                              const SolveRequest& request) {
   const auto rhs = b.contiguous();
-  SolveResult result{empty(rhs.sizes(), rhs.scalar_type()), empty_info(rhs)};
+  SolveResult result{empty(rhs.sizes(), rhs.scalar_type()), empty_info(rhs.size(0), rhs.scalar_type())};
   const auto& solver = request.solver;
   const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const auto caps = request.caps ? request.caps->contiguous() : at::Tensor();
@@ -87,8 +86,7 @@ const char* way_of_last_solve() {
 
 SolveInfo info_of(const std::vector<SampleOutcome>& outcomes, at::ScalarType real) {
   const auto batch = static_cast<int64_t>(outcomes.size());
-  SolveInfo info{at::empty({batch}, at::kLong), at::empty({batch}, at::kDouble), at::empty({batch}, at::kLong),
-                 at::empty({batch}, at::kLong), at::empty({batch}, at::kDouble)};
+  auto info = empty_info(batch, at::kDouble);
   for (int64_t i = 0; i < batch; ++i) {
     const auto& o = outcomes[i];
     info.iterations.mutable_data_ptr<int64_t>()[i] = o.iterations;

@@ -168,7 +168,7 @@ void share_hierarchy(SolveOptions& options, const at::Tensor& b, int64_t solves)
 void share_hierarchy(SolveOptions& options, const at::Tensor& b, std::shared_ptr<KeptHierarchy> of_all) {
   auto* const runtime = runtime_of(b.device());
   if (!runtime || !options.solver.preconditioner.is_multigrid()) return;
-  or_fall_back([&] {
+  or_fall_back([&] {  // to ask whether a graph is captured may raise Unavailable
     if (!runtime->is_capturing(b.device())) options.hierarchy = std::move(of_all);
     return true;
   });

@@ -1,8 +1,11 @@
 #include <ATen/Context.h>
 #include <ATen/core/grad_mode.h>
 
+#include <algorithm>
+#include <cmath>
 #include <cstdlib>
 #include <functional>
+#include <limits>
 
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"

@@ -16,7 +16,7 @@ namespace gpu {
 class KeptHierarchy;
 }
 
-/// What each of them is, methods.h says.
+/// methods.h describes each.
 enum class Method {
   kJacobi,
   kChebyshev,
@@ -48,8 +48,9 @@ class Preconditioner {
   /// Whether it is an operator of the user's own.
   bool is_operator() const { return *this && !is_diagonal() && !is_multigrid(); }
   int64_t smoothing() const { return spec_.shape.empty() ? kDefaultSmoothing : spec_.shape[0]; }
-  /// A V-cycle of multigrid, with so many smoothing steps before and after each coarse grid; for Heat, Poisson, Burgers
-  /// and stencils whose neighbours lie at most one cell away.
+  /// A V-cycle of multigrid, with so many smoothing steps before and after each coarse grid; for Heat, Poisson,
+  /// Diffusion, Burgers, stencils whose neighbours lie at most one cell away and NavierStokes, which takes cycles as a
+  /// preconditioner only.
   static Preconditioner multigrid(int64_t smoothing = kDefaultSmoothing) {
     return OperatorSpec{"multigrid", {smoothing}, {}, {}};
   }

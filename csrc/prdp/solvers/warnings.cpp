@@ -2,6 +2,7 @@
 
 #include <c10/util/Exception.h>
 
+#include <atomic>
 #include <map>
 #include <mutex>
 
@@ -11,8 +12,8 @@ namespace prdp {
 
 namespace {
 
-WarningSink& warning_sink() {
-  static WarningSink sink = [](const std::string& text) { TORCH_WARN(text); };
+std::atomic<WarningSink>& warning_sink() {
+  static std::atomic<WarningSink> sink{[](const std::string& text) { TORCH_WARN(text); }};
   return sink;
 }
 
@@ -44,7 +45,7 @@ void raise_or_warn(const std::string& text, OnFailure on_failure) {
           << in_language("\"zero_grad\"", "OnFailure::kZeroGrad")
           << " the failed ones have no gradient, and a training goes on";
   TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, whole.str());
-  warning_sink()(whole.str());
+  warning_sink().load()(whole.str());
 }
 
 bool should_warn_again(const std::string& key, double size) {
@@ -58,8 +59,9 @@ bool should_warn_again(const std::string& key, double size) {
 }
 
 void warn_this_once(const std::string& text, bool may_get_worse) {
-  warning_sink()(step_prefix() + text +
-                 (may_get_worse ? ". This is said once, and again if it gets ten times worse" : ". This is said once"));
+  warning_sink().load()(
+      step_prefix() + text +
+      (may_get_worse ? ". This is said once, and again if it gets ten times worse" : ". This is said once"));
 }
 
 }  // namespace prdp

@@ -3,7 +3,7 @@
 #include "prdp/autograd/detach_failed.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/memory_check.h"
-#include "prdp/steppers/rollout_vjp.h"
+#include "prdp/steppers/rollout_loops.h"
 
 namespace prdp {
 

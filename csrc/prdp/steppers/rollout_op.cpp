@@ -1,6 +1,7 @@
 #include <ATen/core/dispatch/Dispatcher.h>
 #include <torch/library.h>
 
+#include <algorithm>
 #include <limits>
 
 #include "prdp/operators/kinds.h"
@@ -8,6 +9,7 @@
 #include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/packed_equation.h"
 #include "prdp/steppers/rollout.h"
+#include "prdp/steppers/rollout_loops.h"
 #include "prdp/steppers/rollout_node.h"
 #include "prdp/steppers/stepper.h"
 
@@ -108,9 +110,17 @@ std::vector<at::Tensor> call_vjp(const at::Tensor& cotangent, const KeptSolves& 
                            or_none(kept.residual), needed, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps);
 }
 
+/// The solves of so many steps. Raises ValueError if an int64_t cannot hold their number.
+c10::SymInt count_solves(const c10::SymInt& steps, int64_t picard) {
+  const int64_t most = std::numeric_limits<int64_t>::max() / std::max<int64_t>(picard, 1);
+  TORCH_CHECK_VALUE(steps.is_symbolic() || (steps.expect_int() <= most && steps.expect_int() >= -most),
+                    "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
+  return steps * picard;
+}
+
 /// A rollout as single steps, each of which has all derivatives.
 SolveResult step_by_step(const Equation& equation, const at::Tensor& u, int64_t steps, SolveOptions options) {
-  check_rollout(equation, u, steps * equation.picard_steps, options);
+  check_rollout(equation, u, count_solves(steps, equation.picard_steps), options);
   options.adjoint_log = 0;  // it would hold the first step's alone
   return solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) { return step(equation, state, options); });
 }
@@ -160,11 +170,9 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
   if (in_torch_func() || has_tangent(u) || any_tangent(equation.tensors))
     return step_by_step(equation, u, steps.expect_int(), options);
   const int64_t picard = equation.picard_steps;
-  TORCH_CHECK_VALUE(
-      steps.is_symbolic() || picard < 1 || steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
-      "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
+  const auto solves = count_solves(steps, picard);
   const auto solve = no_mode_is_on() && is_plain_call(u, equation.tensors, options) ? record_rollout : call_solves;
-  auto [solutions, info] = result_of(solve(equation, u, steps * picard, options));
+  auto [solutions, info] = result_of(solve(equation, u, solves, options));
   if (options.backward == Backward::kNone) solutions = from_state(u, solutions);
   if (picard == 1) return {solutions, info};
   return {solutions.slice_symint(1, 0, std::nullopt, picard), reports_of_steps(info, steps, picard)};

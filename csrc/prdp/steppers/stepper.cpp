@@ -2,7 +2,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/solvers/status.h"
-#include "prdp/steppers/rollout_vjp.h"
+#include "prdp/steppers/rollout_loops.h"
 
 namespace prdp {
 

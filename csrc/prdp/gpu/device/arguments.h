@@ -6,8 +6,8 @@
 /// What a kernel is called with. The host and the kernel read the same text.
 namespace prdp::gpu {
 
-/// Vectors that A, or Aᵀ, maps to zero: orthonormal ones of `length` entries, in each of `fields` parts of a sample
-/// from the `first` on.
+/// A null space of A, or of Aᵀ: `count` orthonormal vectors of `length` entries. Each applies to every one of `fields`
+/// consecutive parts of a sample, starting with part `first`.
 template <class T>
 struct NullSpaceArguments {
   const T* basis;  // (count, length); null: the constant vector
@@ -106,7 +106,7 @@ inline constexpr int kVectorsOfCycle = 3;
 /// Blocks of a team keep their parts of so many sums at once.
 inline constexpr int kMostAtOnce = 4;
 
-/// Of each team in `arrived` and, for each of its blocks, in `parts`, where two sums take turns.
+/// Entries of `arrived` per team; and of `parts` per block, for two sums in turn.
 inline constexpr int kArrivedOfTeam = 32, kPartsOfBlock = 2 * kMostAtOnce;
 
 }  // namespace prdp::gpu

@@ -20,12 +20,12 @@ struct FlowStart {
   void operator()(int s, Team& team) const {
     const auto& grid = boundary.grid;
     const T courant = largest_of(team, grid.cells(), [&](int i) { return courant_at(s, grid.place(i)); });
-    const T others = largest_of(team, grid.cells(), [&](int i) { return others_at(s, grid.place(i)); });
+    const T given = largest_of(team, grid.cells(), [&](int i) { return given_at(s, grid.place(i)); });
     const double limit = std::sqrt(static_cast<double>(nu.value()) * free_per_nu);
-    const bool finite = std::isfinite(courant) && std::isfinite(others);
-    const auto verdict = !finite                                                ? SolveStatus::kNonfiniteInput
-                         : courant <= static_cast<T>(limit > 1.0 ? limit : 1.0) ? SolveStatus{}
-                                                                                : SolveStatus::kDiverged;
+    const bool slow = std::isfinite(courant) && courant <= static_cast<T>(limit > 1.0 ? limit : 1.0);
+    const auto verdict = !std::isfinite(given) ? SolveStatus::kNonfiniteInput
+                         : slow                ? SolveStatus{}
+                                               : SolveStatus::kDiverged;
     if (team.leads()) status[s] = static_cast<int64_t>(verdict);
     const bool fine = verdict == SolveStatus{};
     for (int c = 0; c < grid.dim; ++c)
@@ -43,10 +43,11 @@ struct FlowStart {
       sum += static_cast<T>(dt / grid.dx[a]) * std::abs(boundary.inside(s, 2 - a, p));
     return sum;
   }
-  /// Not finite where the force or a wall is not.
-  T others_at(int s, const FlowPlace& p) const {
+  /// Not finite where u, the force or a wall is not. The sum above may also overflow where all are finite.
+  T given_at(int s, const FlowPlace& p) const {
     T sum = 0;
     for (int c = 0; c < boundary.grid.dim; ++c) {
+      sum += T(0) * boundary.inside(s, c, p);
       if (force) sum += T(0) * force.at(s, c, p);
       for (const auto& wall : boundary.walls)
         if (wall) sum += T(0) * wall.at(s, c, p);

@@ -4,6 +4,7 @@
 
 #include <array>
 #include <cmath>
+#include <vector>
 
 #include "prdp/kernels/loops.h"
 #include "prdp/operators/plain_tensors.h"

@@ -16,7 +16,7 @@ struct Beginning {
   RefusedSamples refused;                                    // with kernels, only where `host_looks`
   std::optional<flow_kernels::PaddedVelocity> of_kernels{};  // its status names the refused, whose values are zero
 
-  /// Samples yet to be cleared: with kernels undefined, as their values are zero already.
+  /// Samples that are still to be cleared. Undefined with kernels, which have set their values to zero.
   at::Tensor to_clear() const { return of_kernels ? at::Tensor() : refused.mask; }
   /// 0, or why a sample was refused; undefined: none was.
   at::Tensor status() const;

@@ -2,6 +2,7 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "prdp/operators/operator.h"
@@ -43,13 +44,14 @@ std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i
 RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
   const at::NoGradGuard no_grad;
   const auto courant = courant_numbers(equation, u);
-  auto finite = courant.isfinite();
+  auto finite = at::ones_like(courant, at::kBool);  // all that is given but u
   auto given = equation.wall_velocity;
   given.push_back(equation.force);
   for (const auto& t : given)
     if (t.defined()) finite = finite.logical_and(t.isfinite().flatten(1).all(1));
-  const auto fine = courant.le(largest_courant_number(equation)).logical_and_(finite);
+  const auto fine = courant.le(largest_courant_number(equation)).logical_and_(courant.isfinite()).logical_and_(finite);
   if (fine.all().item<bool>()) return {};
+  finite = finite.logical_and(u.isfinite().flatten(1).all(1));  // of a finite u, too, dt Σ |u|/dx may overflow
   const auto diverged = at::full_like(courant, static_cast<double>(SolveStatus::kDiverged)).to(at::kLong);
   return {fine.logical_not(),
           diverged.masked_fill(finite.logical_not(), static_cast<int64_t>(SolveStatus::kNonfiniteInput))};

@@ -3,7 +3,7 @@
 #include "prdp/autograd/detach_failed.h"
 #include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/flow/step_node.h"
-#include "prdp/steppers/rollout_vjp.h"
+#include "prdp/steppers/rollout_loops.h"
 
 namespace prdp {
 

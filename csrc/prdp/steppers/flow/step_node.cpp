@@ -7,11 +7,9 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/for_each_cotangent.h"
 #include "prdp/operators/autocast.h"
-#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/steppers/rollout_vjp.h"
-#include "prdp/threads/interruption.h"
+#include "prdp/steppers/rollout_loops.h"
 
 namespace prdp {
 

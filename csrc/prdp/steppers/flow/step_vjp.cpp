@@ -1,7 +1,7 @@
 #include <ATen/core/grad_mode.h>
-#include <torch/csrc/autograd/autograd.h>
 
 #include "prdp/operators/tensors.h"
+#include "prdp/operators/with_autograd.h"
 #include "prdp/steppers/flow/balance.h"
 #include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/flow/explicit_loops.h"
@@ -21,25 +21,6 @@ at::Tensor input_of(const at::Tensor& t, bool needed) {
   return at::GradMode::is_enabled() && t.requires_grad() ? t.alias() : t.detach().requires_grad_();
 }
 
-/// grad() of torch, for the inputs that are needed. Outputs without a gradient or a cotangent contribute nothing.
-std::vector<at::Tensor> gradients(std::vector<at::Tensor> outputs, std::vector<at::Tensor> cotangents,
-                                  const std::vector<at::Tensor>& inputs, at::IntArrayRef needed, bool create_graph) {
-  std::vector<at::Tensor> of, bars, wanted;
-  for (size_t i = 0; i < outputs.size(); ++i)
-    if (outputs[i].defined() && outputs[i].requires_grad() && cotangents[i].defined()) {
-      of.push_back(outputs[i]);
-      bars.push_back(cotangents[i]);
-    }
-  for (size_t i = 0; i < inputs.size(); ++i)
-    if (needed[i]) wanted.push_back(inputs[i]);
-  std::vector<at::Tensor> all(inputs.size());
-  if (of.empty() || wanted.empty()) return all;
-  const auto found = torch::autograd::grad(of, wanted, bars, create_graph, create_graph, /*allow_unused=*/true);
-  for (size_t i = 0, next = 0; i < inputs.size(); ++i)
-    if (needed[i]) all[i] = found[next++];
-  return all;
-}
-
 /// The gradients of a step by recording it and differentiating what was recorded. This is slower than the way below,
 /// but has derivatives itself.
 std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
@@ -50,7 +31,8 @@ std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Ten
   for (size_t i = 0; i < given.size(); ++i) inputs.push_back(input_of(given[i], needed[i + 1]));
   const auto step =
       flow_step(equation.with_tensors(at::TensorList(inputs).slice(1)), inputs[0], options, /*reported=*/false);
-  return gradients({step.u, step.potential}, {cotangent.u, cotangent.potential}, inputs, needed, /*create_graph=*/true);
+  return gradients_of({step.u, step.potential}, {cotangent.u, cotangent.potential}, inputs, needed,
+                      /*create_graph=*/true);
 }
 
 /// Of the gradients of u and the tensors of the equation, those that are needed, in the shape, dtype and device of what
@@ -147,8 +129,7 @@ std::vector<at::Tensor> explicit_vjp_by_autograd(const FlowEquation& equation, c
     inputs.push_back(given[i].defined() ? given[i].detach().requires_grad_(needed[i + 1]) : given[i]);
   const auto e = equation.with_tensors(at::TensorList(inputs).slice(1)).for_state(u);
   const auto part = explicit_part_without_kernels(e, with_boundary_values(e, inputs[0]), refused);
-  return gradients({part.velocity, part.change, e.nu}, {velocity_bar, joined(bar.change), bar.nu}, inputs, needed,
-                   /*create_graph=*/false);
+  return gradients_of({part.velocity, part.change, e.nu}, {velocity_bar, joined(bar.change), bar.nu}, inputs, needed);
 }
 
 /// In one launch on a GPU, which adds the share of ν itself: `bar` comes without it.
