@@ -27,7 +27,8 @@ class Diffusion(Operator):
     """Diffusion on the cells of a box by finite volumes: A u = shift·u - ∇·(κ ∇u), the same for every channel of u.
 
     It is symmetric. Where neither a side nor the shift holds u, A is singular; the constant is then its `nullspace`
-    (see `Stencil`). That is told by numbers: a tensor of zeros as shift or h, in all of a sample, is refused. Values and fluxes at the sides that are not zero belong to b: `boundary_rhs` makes that part.
+    (see `Stencil`). That is told by numbers: a sample in which tensors of zeros stand for shift and h is refused.
+    Values and fluxes at the sides that are not zero belong to b: `boundary_rhs` makes that part.
 
     Args:
         kappa: (batch, *shape), or (1, *shape) for all samples alike, κ > 0 in the centres of the cells; shape has 1 to

@@ -146,7 +146,7 @@ def as_operator(who: str, name: str, value: object) -> Operator:
 
 
 def hint_for(value: object) -> str:
-    """How a function becomes an operator, or which one a stepper solves with, where one was given for it; else empty."""
+    """What to give in place of a stepper, or of a function, that was given for an operator; else empty."""
     if hasattr(value, "rollout"):
-        return f", which is a stepper; see operators.{type(value).__name__}" if hasattr(value, "kind") else ", a stepper"
+        return ", which is a stepper" + (f"; see operators.{type(value).__name__}" if hasattr(value, "kind") else "")
     return "; a product A v in a function is operators.Function(matvec)" if callable(value) else ""

@@ -58,7 +58,9 @@ def test_burgers_leaves_out_what_needs_symmetry_or_a_known_spectrum():
     advice = advise(step, field((64,), batch=2))
     assert {"Jacobi", "GMRES(5)", "GMRES(8)", "Direct"} <= {row.name for row in advice.rows}
     assert not {"CG", "Chebyshev"} & {row.name for row in advice.rows}
-    assert "CG, MINRES and SteepestDescent were not tried: A is not symmetric." in advice.notes
+    assert any(
+        note.endswith("SteepestDescent and CG and MINRES were not tried: A is not symmetric.") for note in advice.notes
+    )
     assert any(note.startswith("Chebyshev was not tried: the spectrum is known of Heat") for note in advice.notes)
 
 

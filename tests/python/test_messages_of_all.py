@@ -94,7 +94,10 @@ def make_rhs(operator, way, dtype):
 
 
 # Where a failure must come up: what is to be said with it, and of which methods and operators.
-KRYLOV = r"A is (not symmetric \(‖A v - Aᵀ v‖ is [\d.]+ ‖A v‖ .*\)|symmetric but not definite to float..)[;:] take (GMRES|MINRES)"
+KRYLOV = (
+    r"A is (not symmetric \(‖A v - Aᵀ v‖ is [\d.]+ ‖A v‖ .*\); take GMRES"
+    "|symmetric but not definite to float..: take MINRES)"
+)
 WAYS = {
     "nan": ("NONFINITE_INPUT", r" at index \((0, )*1\), ",
             "the (right-hand side|cotangent) is NaN or Inf there; look at", PAIRS),

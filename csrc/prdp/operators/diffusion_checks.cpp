@@ -152,9 +152,13 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
 }
 
 at::Tensor DiffusionOperator::unheld() const {
-  bool by_values = shift_.dim() > 0;
-  for (const auto& h : robin_) by_values = by_values || h.dim() > 0;
-  if (names_null_space_ || known_held_ || !by_values) return {};
+  const auto is_number = [](const at::Tensor& t) { return t.dim() == 0 && is_plain(t) && t.is_cpu(); };
+  bool by_fields = shift_.dim() > 0, by_number = is_number(shift_) && number_of(shift_) != 0.0;
+  for (const auto& h : robin_) {
+    by_fields = by_fields || h.dim() > 0;
+    by_number = by_number || (is_number(h) && number_of(h) != 0.0);
+  }
+  if (names_null_space_ || known_held_ || by_number || !by_fields) return {};
   for (const auto& of_axis : sides_)
     if (of_axis[0] == Side::kZero || of_axis[1] == Side::kZero) return {};
   const auto in_each = [&](const at::Tensor& t) {

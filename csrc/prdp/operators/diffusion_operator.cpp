@@ -214,7 +214,7 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
   view.tensors[kKappa] = kappa_.contiguous();
   auto field = kappa_.sizes().vec();
   field[0] = field[1] = 1;
-  take(shift_or_nan(), field, kShift, kShiftNumber);
+  take(shift_, field, kShift, kShiftNumber);
   for (size_t axis = 0; axis < 3; ++axis) {
     const int64_t d = static_cast<int64_t>(axis) - 3 + dim();
     for (size_t end = 0; end < 2; ++end) {

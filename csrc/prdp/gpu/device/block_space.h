@@ -62,6 +62,9 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     if (!scale_operator<T>(team_, a_)) return false;
     factor_ = a_.factor();
     norm_ = largest_over_rows([&](int i) { return a_.norm_of_row(i); });
+    if constexpr (requires { A::kMayBeUnheld; })
+      if (A::kMayBeUnheld && !is_singular())
+        return largest_over_rows([&](int i) { return std::abs(a_.row_sum(i)); }) > 0;
     return true;
   }
   T factor() const { return factor_; }

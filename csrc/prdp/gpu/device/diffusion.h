@@ -31,6 +31,9 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
     }
   }
 
+  /// Whether the shift and the Robin sides alone hold u, and A is singular where they are zero.
+  static constexpr bool kMayBeUnheld = ((kSides != kZeroSide) && ...);
+
   using Cycled = Diffusion;
   using Points = G;
   static constexpr bool periodic(int axis) {
