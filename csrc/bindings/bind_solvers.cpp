@@ -42,16 +42,18 @@ class StepOfRollout {
   std::optional<FailuresOfStep> here_;
 };
 
-std::vector<std::string> library_folders;  // of this package and of torch
+/// What the files of this package, of torch and of Python's own start begin with; a tuple that outlives the
+/// interpreter.
+py::tuple* not_of_user = nullptr;
 
-/// The level of the innermost frame on Python's stack that is neither ours nor torch's; 1 where there is none.
+/// The level of the innermost frame on Python's stack that is the user's; 1 where there is none.
 int level_of_user() {
-  int level = 1;
-  auto frame = py::reinterpret_borrow<py::object>(reinterpret_cast<PyObject*>(PyEval_GetFrame()));
-  for (; frame && !frame.is_none(); frame = frame.attr("f_back"), ++level) {
-    const auto file = frame.attr("f_code").attr("co_filename").cast<std::string>();
-    const auto holds = [&](const std::string& folder) { return file.compare(0, folder.size(), folder) == 0; };
-    if (std::none_of(library_folders.begin(), library_folders.end(), holds)) return level;
+  try {
+    int level = 1;
+    auto frame = py::reinterpret_borrow<py::object>(reinterpret_cast<PyObject*>(PyEval_GetFrame()));
+    for (; frame && !frame.is_none(); frame = frame.attr("f_back"), ++level)
+      if (!frame.attr("f_code").attr("co_filename").attr("startswith")(*not_of_user).cast<bool>()) return level;
+  } catch (const py::error_already_set&) {  // a name that is no text
   }
   return 1;
 }
@@ -204,8 +206,10 @@ void bind_reports(py::module_& m) {
 }  // namespace
 
 void bind_solvers(py::module_& m) {
-  for (const char* package : {"prdp_torch", "torch"})
-    library_folders.push_back(py::str(py::module_::import(package).attr("__path__")[py::int_(0)]));
+  const auto files_of = [](const char* package) {
+    return py::module_::import("os.path").attr("join")(py::module_::import(package).attr("__path__")[py::int_(0)], "");
+  };
+  not_of_user = new py::tuple(py::make_tuple(files_of("prdp_torch"), files_of("torch"), "<frozen "));
   set_warning_sink(warn_in_python);
   main_thread = py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
   interruption::set_check(check_signals);

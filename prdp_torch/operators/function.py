@@ -93,7 +93,8 @@ class Function(Operator):
         return Function, (matvec, transpose, tuple(tensors), diagonal, symmetric, right, left)
 
 
-_CODES: "weakref.WeakKeyDictionary[Any, dict[int, _C.FunctionCode]]" = weakref.WeakKeyDictionary()
+_Codes: TypeAlias = "weakref.WeakKeyDictionary[Any, _C.FunctionCode]"
+_CODES: "weakref.WeakKeyDictionary[Any, _Codes]" = weakref.WeakKeyDictionary()  # by matvec, then by transpose
 
 
 def _code(function: Any) -> Any:
@@ -108,10 +109,10 @@ def _code(function: Any) -> Any:
 def _shared_code(matvec: Product, transpose: Product | None) -> _C.FunctionCode:
     """One for all operators that are made of the same code, as those of a step that makes its operator anew."""
     try:
-        of_matvec = _CODES.setdefault(_code(matvec), {})
+        of_matvec = _CODES.setdefault(_code(matvec), weakref.WeakKeyDictionary())
+        return of_matvec.setdefault(_code(transpose or _shared_code), _C.FunctionCode())
     except (TypeError, ValueError):  # neither code nor an object that can be referred to weakly
         return _C.FunctionCode()
-    return of_matvec.setdefault(id(_code(transpose)), _C.FunctionCode())
 
 
 def _tensor(name: str, value: object) -> Tensor:

@@ -145,3 +145,15 @@ def test_on_a_fine_grid_in_float32_it_is_solved_as_well_as_the_dtype_allows():
     assert poisson.info.solved.all() and poisson.info.floor[0] < poisson.info.residual[0] < 32 * poisson.info.floor[0]
     exact = poisson(b)
     assert (u - exact).norm() < 1e-5 * exact.norm()
+
+
+@pytest.mark.filterwarnings("ignore:.* STAGNATED far above rtol", "ignore:.* with a residual above")
+@pytest.mark.parametrize("n", [3500, 20000])
+def test_a_smooth_load_on_many_points_of_a_line_is_solved_though_its_residual_is_above_b(n):
+    """What float32 leaves of the residual grows by n², the error of u by n alone: the factors are those of float64."""
+    exact = torch.sin(torch.pi * torch.arange(1, n + 1, dtype=F64) / (n + 1)).float()
+    poisson, heat = prdp.Poisson((n,), prdp.Direct()), prdp.Heat((n,), 1.0, 1e6, prdp.Direct())
+    for step, scale in ((poisson, torch.pi**2), (heat, 1 + 1e6 * torch.pi**2)):
+        u = step(scale * exact.view(1, 1, n))[0, 0]
+        assert step.info.status.item() == prdp.SolveStatus.STAGNATED and step.info.solved.all()
+        torch.testing.assert_close(u, exact, rtol=0.0, atol=1e-4)

@@ -1,5 +1,6 @@
 """The adjoint solve of a Function is compared with its solve: <lambda, b> = <u, u_bar> but for their residuals."""
 
+import gc
 import warnings
 
 import pytest
@@ -116,3 +117,16 @@ def test_another_wrong_transpose_is_said_again():
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             solve(lambda v: v @ m)
+
+
+def test_a_wrong_transpose_is_said_where_another_one_has_gone():
+    """A later code may have the address of an earlier one."""
+    m = matrix()
+    for k in range(6):
+        scope = {"m": m}
+        exec(f"def transpose(v): return {k + 2}.0 * (v @ m)", scope)
+        with pytest.warns(UserWarning, match=SAYS):
+            a = operators.Function(lambda v: v @ m.mT, transpose=scope["transpose"])
+            gradient(a, prdp.GMRES(9, restart=12))
+        del a, scope
+        gc.collect()

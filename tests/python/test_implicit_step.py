@@ -298,3 +298,9 @@ def test_mistakes_are_named_before_any_work(call, error, message):
 
 def run(operator, rhs=None, u=None):
     return prdp.ImplicitStep(operator, rhs, prdp.CG(3))(field((N,)) if u is None else u)
+
+
+def test_a_right_hand_side_may_write_to_another_state_of_a_history():
+    history = torch.stack([field((N,)), torch.zeros_like(field((N,)))])
+    step = prdp.ImplicitStep(HEAT, lambda u: history[1].copy_(u) * 1.0, prdp.Direct())
+    torch.testing.assert_close(step(history[0]), prdp.ImplicitStep(HEAT, None, prdp.Direct())(history[0]))

@@ -157,3 +157,11 @@ def test_a_warning_names_the_users_line(always):
         torch.nn.Sequential(step)(torch.ones(1, 2))
         prdp.linear_solve(matrix, torch.ones(1, 2), prdp.Jacobi(3), on_failure="warn")
     assert [warning.filename for warning in said] == [__file__, __file__]
+
+
+def test_a_warning_comes_out_whatever_the_users_file_is_called(always):
+    scope = {}
+    text = "def solve(prdp, a, b): return prdp.linear_solve(a, b, prdp.Jacobi(3), on_failure='warn')"
+    exec(compile(text, "/home/\udce9.py", "exec"), scope)
+    with pytest.warns(UserWarning, match="MAX_ITER|ended far above"):
+        scope["solve"](prdp, torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.ones(1, 2))

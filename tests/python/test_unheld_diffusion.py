@@ -32,28 +32,42 @@ def robin(h):
 
 
 REFUSED = r"Diffusion: in sample 0 neither the shift nor a side holds u, so A is singular; .* give shift=0.0"
-OF_EACH = {
+WAYS = {
     "field": lambda: Diffusion(KAPPA, ZEROS, "flux"),
     "numbers": lambda: Diffusion(KAPPA, ZEROS[:, :1, :1], ["flux", "periodic"]),
     "h": lambda: Diffusion(KAPPA, 0.0, robin(ZEROS[:, :, 0])),
     "both": lambda: Diffusion(KAPPA, ZEROS, robin(0.0)),
+    "of all": lambda: Diffusion(KAPPA, ZEROS[:1], "periodic"),
+    "a number in a tensor": lambda: Diffusion(KAPPA, torch.nn.Parameter(ZEROS[0, 0, 0].clone()), "flux"),
+    "numbers in tensors": lambda: Diffusion(KAPPA, 0.0, robin(ZEROS[0, 0, 0].clone())),
     "per axis": lambda: Diffusion(torch.stack((KAPPA, KAPPA), 1), ZEROS, "flux", per_axis=True),
 }
 
 
-@pytest.mark.parametrize("name", OF_EACH)
+@pytest.mark.parametrize("name", WAYS)
 def test_it_is_refused_before_any_work(name):
     for solver in SOLVERS:
         with pytest.raises(ValueError, match=REFUSED):
-            prdp.linear_solve(OF_EACH[name](), right_hand_side(), solver)
-        u, info = prdp.linear_solve(OF_EACH[name](), right_hand_side(), solver, on_failure="return")
+            prdp.linear_solve(WAYS[name](), right_hand_side(), solver)
+        u, info = prdp.linear_solve(WAYS[name](), right_hand_side(), solver, on_failure="return")
         assert (info.status == -9).all() and not u.any()
 
 
-def test_what_all_samples_share_is_refused_at_once():
-    for shift, sides in ((ZEROS[:1], "periodic"), (0.0, robin(ZEROS[:1, :, 0]))):
+@pytest.mark.parametrize("name", WAYS)
+def test_on_a_device_it_fails_as_well(name):
+    with Fibers(threads=32):
+        u, info = prdp.linear_solve(WAYS[name](), right_hand_side(), prdp.CG(99), on_failure="return")
         with pytest.raises(ValueError, match=REFUSED):
-            Diffusion(KAPPA, shift, sides)
+            prdp.linear_solve(WAYS[name](), right_hand_side(), prdp.CG(99))
+    assert info.way == "kernel" and (info.status == -9).all() and not u.any()
+
+
+def test_an_operator_that_is_not_solved_with_may_be_made():
+    shift = torch.zeros(1, *SHAPE, dtype=F64)
+    a = Diffusion(KAPPA, shift, "flux")
+    assert a.boundary_rhs(fluxes=1.0).any() and a.dense().isfinite().all()
+    shift.fill_(1.0)
+    assert prdp.linear_solve(a, right_hand_side(), prdp.CG(99))[1].solved.all()
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=repr)
@@ -64,6 +78,8 @@ def test_a_sample_that_nothing_holds_fails_alone(solver):
         prdp.linear_solve(Diffusion(KAPPA, shift, "flux"), b, solver)
     u, info = prdp.linear_solve(Diffusion(KAPPA, shift, "flux"), b, solver, on_failure="return")
     assert info.status[1] == -9 and u[1].abs().max() == 0 and info.solved[[0, 2]].all()
+    lone = prdp.linear_solve(Diffusion(KAPPA[1:2], shift[1:2], "flux"), b[1:2], solver, on_failure="zero_grad")[1]
+    assert lone.status.tolist() == [-9]
     found = torch.autograd.grad(u.square().sum(), (b, shift))
     others = [0, 2]
     alone = Diffusion(KAPPA[others], shift[others], "flux")
@@ -73,13 +89,15 @@ def test_a_sample_that_nothing_holds_fails_alone(solver):
     assert found[0][1].abs().max() == 0 and found[1][1] == 0
 
 
-def test_on_a_device_it_fails_as_well():
+def test_on_a_device_and_in_tensor_operations_it_fails_alone():
     shift = torch.tensor([2.0, 0.0, 0.5], dtype=F64).view(3, 1, 1)
+    a, b = Diffusion(KAPPA, shift, "flux"), right_hand_side()
     with Fibers(threads=32):
-        u, info = prdp.linear_solve(
-            Diffusion(KAPPA, shift, "flux"), right_hand_side(), prdp.CG(99), on_failure="return"
-        )
-    assert info.way == "kernel" and info.status.tolist() == [1, -9, 1] and u[1].abs().max() == 0
+        u, info = prdp.linear_solve(a, b, prdp.CG(99), on_failure="return")
+    assert info.way == "kernel" and info.status.tolist() == [1, -9, 1] and not u[1].any()
+    own = prdp.CG(99, preconditioner=prdp.operators.Function(lambda v: v, symmetric=True))
+    u, info = prdp.linear_solve(a, b, own, on_failure="return")
+    assert info.way == "tensors" and info.status.tolist() == [1, -9, 1] and not u[1].any()
 
 
 def test_what_one_number_holds_is_solved():

@@ -67,6 +67,10 @@ class Laplacian final : public Kernel<T> {
     return centre_ * centre_ * change2[0];
   }
   std::optional<double> radius() const override { return radius_; }
+  /// By the condition number of A, (1 + ρ)/(1 - ρ).
+  bool has_definite_factors(const T* /*x*/, const T* /*b*/) const override {
+    return 1.0 + radius_ < kWidestRowsOfFactors * (1.0 - radius_);
+  }
   void smooth(const T* b, const T* x, T* y, T p, T q) const override {
     share_rows::for_each(parts(), [&](int64_t i) {
       const auto [a, at] = part(i, apply_weights_);

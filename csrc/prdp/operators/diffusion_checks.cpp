@@ -1,3 +1,4 @@
+#include <ATen/Dispatch.h>
 #include <ATen/EmptyTensor.h>
 #include <ATen/TensorSubclassLikeUtils.h>
 
@@ -27,6 +28,21 @@ at::Tensor in_dtype(const at::Tensor& t, at::ScalarType dtype) {
   if (dtype == at::kFloat) *number.mutable_data_ptr<float>() = static_cast<float>(number_of(t));
   else *number.mutable_data_ptr<double>() = number_of(t);
   return number;
+}
+
+/// Which samples of a number or a field are zero throughout: (batch or 1).
+at::Tensor zero_samples(const at::Tensor& t) {
+  if (t.dim() == 0) return t.eq(0).view({1});
+  if (!t.is_cpu() || !is_plain(t) || !t.is_contiguous()) return t.eq(0).flatten(1).all(1);
+  auto zero = at::empty({t.size(0)}, at::kBool);  // in one pass, which ends where it finds a number
+  AT_DISPATCH_FLOATING_TYPES(t.scalar_type(), "zero_samples", [&] {
+    const int64_t length = t.numel() / std::max<int64_t>(t.size(0), 1);
+    for (int64_t s = 0; s < t.size(0); ++s) {
+      const auto* first = t.const_data_ptr<scalar_t>() + s * length;
+      zero.mutable_data_ptr<bool>()[s] = std::all_of(first, first + length, [](scalar_t x) { return x == 0; });
+    }
+  });
+  return zero;
 }
 
 }  // namespace
@@ -152,22 +168,20 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
 }
 
 at::Tensor DiffusionOperator::unheld() const {
-  const auto is_number = [](const at::Tensor& t) { return t.dim() == 0 && is_plain(t) && t.is_cpu(); };
-  bool by_fields = shift_.dim() > 0, by_number = is_number(shift_) && number_of(shift_) != 0.0;
-  for (const auto& h : robin_) {
-    by_fields = by_fields || h.dim() > 0;
-    by_number = by_number || (is_number(h) && number_of(h) != 0.0);
-  }
-  if (names_null_space_ || known_held_ || by_number || !by_fields) return {};
+  if (names_null_space_ || known_held_) return {};
   for (const auto& of_axis : sides_)
     if (of_axis[0] == Side::kZero || of_axis[1] == Side::kZero) return {};
-  const auto in_each = [&](const at::Tensor& t) {
-    const auto there = t.detach().ne(0).to(kappa_.device());
-    return there.dim() == 0 ? there.view({1}) : there.flatten(1).any(1);
-  };
-  auto held = in_each(shift_);
-  for (const auto& h : robin_) held = held.logical_or(in_each(h));
-  return held.logical_not();
+  auto holds = robin_;
+  holds.push_back(shift_);
+  for (const auto& t : holds)
+    if (t.dim() == 0 && t.is_cpu() && is_plain(t) && number_of(t) != 0.0) return {};
+  at::Tensor lost;
+  for (const auto& t : holds) {
+    const auto zero = zero_samples(t.detach()).to(kappa_.device());
+    lost = lost.defined() ? lost.logical_and(zero) : zero;
+  }
+  known_held_ = lost.is_cpu() && is_plain(lost) && !lost.any().item<bool>();
+  return known_held_ ? at::Tensor() : lost;
 }
 
 at::Tensor DiffusionOperator::shift_or_nan() const {
@@ -180,6 +194,11 @@ at::Tensor DiffusionOperator::shift_or_nan() const {
   return (shift_ + added).expand(field);
 }
 
+at::Tensor DiffusionOperator::nonfinite_samples(const at::Tensor& b) const {
+  const auto nonfinite = Operator::nonfinite_samples(b), lost = unheld();
+  return lost.defined() ? nonfinite.logical_or(lost) : nonfinite;
+}
+
 void DiffusionOperator::check_parameters(Checks checks) const {
   for (const auto& [name, t] : tensors())
     if (at::isTensorSubclassLike(t) || t.is_meta() || t.numel() == 0) return;  // no numbers, or none yet
@@ -190,14 +209,10 @@ void DiffusionOperator::check_parameters(Checks checks) const {
                       "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
   }
   if (checks == Checks::kHost) return;
-  if (const auto lost = unheld(); lost.defined()) {
-    const bool any = lost.any().item<bool>();
-    known_held_ = !any;
-    const bool is_refused = any && (checks != Checks::kShared || lost.size(0) == 1);
-    TORCH_CHECK_VALUE(!is_refused, "Diffusion: in sample ", first_true(lost)[0], " ", kUnheld,
-                      "; if that is meant, give ", in_language("shift=0.0", "0.0 as shift"),
+  if (const auto lost = checks == Checks::kAll ? unheld() : at::Tensor(); lost.defined() && lost.any().item<bool>())
+    TORCH_CHECK_VALUE(false, "Diffusion: in sample ", first_true(lost)[0], " ", kUnheld, "; if that is meant, give ",
+                      in_language("shift=0.0", "0.0 as shift"),
                       ", a number, which makes the constant the null space of all samples");
-  }
   known_positive_ = kappa_.min().item<double>() > 0.0;
   if (known_positive_) return;
   const auto wrong = kappa_.le(0);

@@ -52,6 +52,7 @@ class DiffusionOperator final : public Operator {
   at::Tensor norm() const override;
   at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  at::Tensor nonfinite_samples(const at::Tensor& b) const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override;
@@ -109,7 +110,7 @@ class DiffusionOperator final : public Operator {
   std::vector<double> lengths_;
   FaceMean mean_;
   bool per_axis_, names_null_space_;
-  mutable bool known_positive_ = false, known_held_ = false;  // by check_parameters(), so that nobody looks again
+  mutable bool known_positive_ = false, known_held_ = false;  // once somebody has looked, so that nobody looks again
   // With an axis of one channel, or of those of κ, and one of extent 1 where a side has none; or 0-dimensional.
   at::Tensor kappa_, shift_;
   std::vector<at::Tensor> robin_;  // h of each Robin side, in their order
