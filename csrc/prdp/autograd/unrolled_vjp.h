@@ -15,7 +15,7 @@ namespace prdp {
 ///   solved by a method that is no polynomial in A, but b̄ or Ā is too far from the implicit one
 ///                                                   the same: b excites few eigenvectors, and the derivative of the
 ///                                                   iterations is one in those directions alone, or rounding; or
-///                                                   a recurrence, such as BiCGStab's, came near a breakdown
+///                                                   a recurrence came near a breakdown
 ///   failed, with on_failure="zero_grad"             get none
 ///   all others                                      get the derivative of exactly their iterations
 /// The report of a sample with the implicit derivative is that of its adjoint solve. For the last kind it has the
