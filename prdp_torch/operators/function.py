@@ -110,7 +110,7 @@ def _shared_code(matvec: Product, transpose: Product | None) -> _C.FunctionCode:
     """One for all operators that are made of the same code, as those of a step that makes its operator anew."""
     try:
         of_matvec = _CODES.setdefault(_code(matvec), weakref.WeakKeyDictionary())
-        return of_matvec.setdefault(_code(transpose or _shared_code), _C.FunctionCode())
+        return of_matvec.setdefault(_code(_shared_code if transpose is None else transpose), _C.FunctionCode())
     except (TypeError, ValueError):  # neither code nor an object that can be referred to weakly
         return _C.FunctionCode()
 

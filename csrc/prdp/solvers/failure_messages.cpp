@@ -30,6 +30,8 @@ std::string name_of(const Solver& solver) {
   return text.str();
 }
 
+const char* precision_of(const at::Tensor& b) { return b.scalar_type() == at::kFloat ? "float32" : "float64"; }
+
 double norm_of(const at::Tensor& v) { return v.to(at::kDouble).norm().item<double>(); }
 
 double value_of_sample(const at::Tensor& t, int64_t sample) {
@@ -75,7 +77,7 @@ std::string not_definite(const SolveRole& role, const Operator& a, const at::Ten
     return "what keeps A from being singular, such as its shift, is lost in the rounding of float32; take float64";
   if (auto found = asymmetric(role, a, b, sample); !found.empty()) return found;
   const bool single = b.scalar_type() == at::kFloat;
-  return std::string("A is symmetric but not definite to ") + (single ? "float32" : "float64") +
+  return std::string("A is symmetric but not definite to ") + precision_of(b) +
          ": take MINRES if it is indefinite, name all its null vectors (nullspace) if it is singular, and take " +
          (single ? "float64" : "Direct") + " if it is ill-conditioned";
 }
@@ -125,7 +127,7 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
   const bool known = norm > 0.0;  // not of a function
   if (!known && !is_finite(a, b, sample))
     return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
-  return "a number left the range of " + std::string(single ? "float32" : "float64") + " (" +
+  return "a number left the range of " + std::string(precision_of(b)) + " (" +
          (known ? "‖A‖ is " + three_digits(norm) + ", " : "") + "‖b‖ is " +
          (std::isinf(norm_b) ? "above 1.8e+308" : three_digits(norm_b)) + "); " +
          (single ? "take float64, or scale A and b" : "scale A and b");
@@ -187,7 +189,7 @@ std::string stagnated(const SolveRole& role, const Operator& a, const at::Tensor
                              : solver.preconditioner.is_multigrid()
                                  ? "take another preconditioner than multigrid, or Direct"
                                  : "take another preconditioner or Direct";
-  return "the residual falls no further in " + std::string(single ? "float32" : "float64") + ", and u may be wrong; " +
+  return "the residual falls no further in " + std::string(precision_of(b)) + ", and u may be wrong; " +
          (single ? "solve it in float64 once to see, and if it is, stay there, or " : "") + others +
          ", or scale A and b so that their rows are of one size";
 }
