@@ -1,7 +1,7 @@
 // A libcuda.so.1 without a GPU. It refuses, as a driver that is too old for this program does; with -DWITHOUT_NEWER it
 // lacks functions of today; with -DWORKS it has devices of two multiprocessors, which run a block each unless CROWDED is
-// set. Streams are captured where CAPTURING is set, and memory is short for as many modules as SHORT says. It prints each
-// launch.
+// set. Its VERSION is 13000. Streams are captured where CAPTURING is set, and memory is short for as many modules as
+// SHORT says. It prints each launch.
 #include <stddef.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -33,7 +33,8 @@ int cuStreamIsCapturing(void* stream, int* status) {
   return RESULT;
 }
 int cuDriverGetVersion(int* version) {
-  *version = 13000;
+  const char* const of_cuda = getenv("VERSION");
+  *version = of_cuda ? atoi(of_cuda) : 13000;
   return RESULT;
 }
 int cuDeviceGet(int* device, int index) {
@@ -84,4 +85,5 @@ int cuLaunchCooperativeKernel(void* function, unsigned x, unsigned y, unsigned z
 }
 #endif
 ANSWERS(cuInit)
+ANSWERS(cuThreadExchangeStreamCaptureMode)
 ANSWERS(cuModuleGetFunction)

@@ -184,10 +184,6 @@ T __shfl_xor_sync(unsigned, T value, int lane, int line = __builtin_LINE()) {
   fibers::wait_at(warp, fibers::kLanesOfWarp, -line);
   return other;
 }
-template <class T>
-T __ldcg(const T* p) {
-  return *const_cast<const volatile T*>(p);
-}
 inline unsigned atomicAdd(unsigned* p, unsigned v) { return __atomic_fetch_add(p, v, __ATOMIC_SEQ_CST); }
 
 namespace fibers {

@@ -220,8 +220,9 @@ def test_a_driver_that_captures_and_a_device_without_room(ask, cache):
 def test_a_kernel_that_did_not_load_for_want_of_memory_is_tried_again(ask, cache):
     assert TRIVIAL.compile(90)[1] == ""
     why = ["prdp_why_no_kernel_of_cuda", TRIVIAL.text]
-    assert ask([*why, 1], "-DWORKS", SHORT="1") == "the kernel does not load: out of memory (2)"
-    assert ask([*why, 2], "-DWORKS", SHORT="1") == ""
+    assert ask([*why, 1], "-DWORKS", SHORT="1") == ""  # at once, after torch has let go of what it keeps
+    assert ask([*why, 1], "-DWORKS", SHORT="2") == "the kernel does not load: out of memory (2)"
+    assert ask([*why, 2], "-DWORKS", SHORT="2") == ""
 
 
 @with_a_driver_of_our_own
@@ -234,6 +235,18 @@ def test_a_launch_from_a_thread_without_a_context(ask, cache, device):
             f"{how} blocks of 64 threads with 60000 bytes in context {1 + device} on stream {100 * device + 7}, "
             "argument 42"
         )
+
+
+@with_a_driver_of_our_own
+def test_nvrtc_is_that_of_the_version_of_the_driver(ask, tmp_path, cache):
+    """As an older driver may not load what a newer NVRTC compiles."""
+    for version, body in (("12", ""), ("13", "int nvrtcVersion(void) { return 0; }")):
+        (tmp_path / "stub.c").write_text(body)
+        stub = tmp_path / f"libnvrtc.so.{version}"
+        subprocess.run(["cc", "-shared", "-fPIC", str(tmp_path / "stub.c"), "-o", str(stub)], check=True)
+    why = ["prdp_why_no_kernel_of_cuda", TRIVIAL.text, 1]
+    assert ask(why, "-DWORKS", VERSION="12080").endswith("it has no nvrtcVersion")
+    assert ask(why, "-DWORKS", VERSION="13000").endswith("it has no nvrtcCreateProgram")
 
 
 def test_a_solve_whose_kernel_cannot_be_made_is_done_by_tensor_operations():

@@ -5,8 +5,8 @@ import warnings
 
 import pytest
 import torch
-from fibers import ROOT, SHUFFLED, Fibers
-from test_gpu_kernels import noise, sparse
+from fibers import BACKWARD, ROOT, SHUFFLED, Fibers
+from test_gpu_kernels import agree, noise, solve, sparse
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -129,9 +129,10 @@ def csr(values, crow=None, col=None):
 
 
 @pytest.mark.parametrize(("name", "device"), [(name, {}) for name in OPERATORS_OF_A_STEP] + [("heat", {"cells": 16})])
-def test_a_solve_is_one_launch_and_at_most_five_operations_of_torch(name, device):
-    """Views and memory alone, so that the host looks at nothing: forward and back. A transposed sparse matrix is
-    sorted."""
+@pytest.mark.parametrize("on_failure", ["return", "raise"])
+def test_a_solve_is_one_launch_and_at_most_five_operations_of_torch(name, device, on_failure):
+    """Views and memory alone, so that the host looks at nothing, forward and back; or at the statuses, once, where
+    failures raise. A transposed sparse matrix is sorted."""
     make, shape = OPERATORS_OF_A_STEP[name]
     b, w, solver = noise(*shape).requires_grad_(), torch.ones(shape, dtype=F64), prdp.BiCGStab(max_iter=50, rtol=1e-8)
 
@@ -146,10 +147,12 @@ def test_a_solve_is_one_launch_and_at_most_five_operations_of_torch(name, device
     with Fibers(poison=False, **device) as fibers:
         for seed in (0, 1):  # the first results of a kernel are compared
             a = make(seed)
-            solved, forward = counted(lambda a=a: prdp.linear_solve(a, b, solver, on_failure="return"))
+            solved, forward = counted(lambda a=a: prdp.linear_solve(a, b, solver, on_failure=on_failure))
             _, back = counted(lambda u=solved[0]: torch.autograd.grad(u, b, w))
     for names in (forward, *([] if "sparse" in name else [back])):
-        assert len(names) <= (6 if name == "sparse matrices" else 5) and set(names) <= MEMORY, names
+        others = [n for n in names if n != "to"]
+        assert len(names) - len(others) == (on_failure == "raise"), names
+        assert len(others) <= (6 if name == "sparse matrices" else 5) and set(others) <= MEMORY, names
 
 
 @pytest.mark.parametrize("captures", [False, True])
@@ -283,3 +286,12 @@ def test_results_that_nobody_can_judge_are_looked_at_a_few_times():
                 prdp.linear_solve(a, b, prdp.CG(max_iter=7, rtol=1e-3), on_failure="return")
             looks.append(sum(event.name == "aten::nonzero" for event in seen.events()))
     assert looks == [1, 1, 1, 0, 0]
+
+
+def test_a_sum_over_more_blocks_than_a_warp_has_threads():
+    a, b = operators.Heat(SHAPE, 0.03, 1.0), noise(1, 1, *SHAPE)
+    device = {"cells": 1}  # 42 blocks
+    mine, other = (solve(a, b, prdp.CG(max_iter=60, rtol=1e-10), of) for of in (device, None))
+    agree(mine, other, F64, slack=1e6)
+    backward = solve(a, b, prdp.CG(max_iter=60, rtol=1e-10), {**device, "order": BACKWARD})
+    assert torch.equal(backward[0], mine[0])

@@ -166,12 +166,14 @@ def test_the_diagonal_as_preconditioner_is_that_of_the_cpu(name, method, dtype):
 
 
 SWAP, ONES = torch.tensor([[0.0, 1.0], [1.0, 0.0]]), torch.tensor([1.0, 0.0])
+FIRST_TWICE_SECOND = torch.tensor([[1.0, 2.0], [2.0, 1.0]])  # Jacobi doubles its error
 ENDS = [  # the status of one sample, what it is made of, and a method
     ("BREAKDOWN", SWAP, ONES, prdp.CG(9)),
     ("BREAKDOWN", SWAP, ONES, prdp.SteepestDescent(9)),
     ("BREAKDOWN", SWAP, ONES, prdp.BiCGStab(9)),
     ("STAGNATED", SWAP, ONES, prdp.GMRES(40, restart=1)),
     ("CONVERGED_BREAKDOWN", SWAP, ONES, prdp.GMRES(9, restart=2)),
+    ("DIVERGED", FIRST_TWICE_SECOND, ONES, prdp.Jacobi(99)),
     ("OVERFLOW", 1e-20 * torch.eye(2), 1e30 * ONES, prdp.CG(9)),
     ("OVERFLOW", 1e-20 * torch.eye(2), 1e30 * ONES, prdp.GMRES(9, restart=2)),
 ]

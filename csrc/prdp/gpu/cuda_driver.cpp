@@ -22,6 +22,7 @@ const CudaDriver& CudaDriver::get() {
     library.bind(d.set_attribute, "cuFuncSetAttribute");
     library.bind(d.blocks_at_once, "cuOccupancyMaxActiveBlocksPerMultiprocessor");
     library.bind(d.is_capturing, "cuStreamIsCapturing");
+    library.bind(d.exchange_capture_mode, "cuThreadExchangeStreamCaptureMode");
     library.bind(d.launch, "cuLaunchKernel");
     library.bind(d.launch_cooperative, "cuLaunchCooperativeKernel");
     d.check(d.init(0), "the driver does not start");
@@ -36,8 +37,8 @@ void CudaDriver::check(int result, const char* what) const {
   error_text(result, &text);
   const std::string why =
       std::string(what) + ": " + (text ? text : "unknown error") + " (" + std::to_string(result) + ")";
-  constexpr int out_of_memory = 2, first_of_capture = 900, last_of_capture = 909;  // CUresult in cuda.h
-  if (result == out_of_memory || (result >= first_of_capture && result <= last_of_capture)) throw UnavailableNow(why);
+  constexpr int first_of_capture = 900, last_of_capture = 909;  // CUresult in cuda.h
+  if (result == kOutOfMemory || (result >= first_of_capture && result <= last_of_capture)) throw UnavailableNow(why);
   throw Unavailable(why);
 }
 

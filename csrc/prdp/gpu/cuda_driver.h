@@ -5,6 +5,8 @@ namespace prdp::gpu {
 
 /// The functions of NVIDIA's driver that the library calls, as cuda.h declares them. A result of 0 is success.
 struct CudaDriver {
+  static constexpr int kOutOfMemory = 2;
+
   int (*init)(unsigned);
   int (*version)(int*);
   int (*error_text)(int, const char**);
@@ -18,6 +20,7 @@ struct CudaDriver {
   int (*set_attribute)(void* function, int which, int value);
   int (*blocks_at_once)(int*, void* function, int threads, size_t memory);
   int (*is_capturing)(void* stream, int*);
+  int (*exchange_capture_mode)(int*);
   int (*launch)(void* function, unsigned x, unsigned y, unsigned z, unsigned threads, unsigned, unsigned,
                 unsigned memory, void* stream, void** arguments, void** extra);
   int (*launch_cooperative)(void* function, unsigned x, unsigned y, unsigned z, unsigned threads, unsigned, unsigned,

@@ -1,11 +1,13 @@
 #include "prdp/gpu/cuda_runtime.h"
 
+#include <c10/core/CachingDeviceAllocator.h>
 #include <c10/core/DeviceGuard.h>
 #include <c10/core/impl/VirtualGuardImpl.h>
 
 #include <map>
 #include <mutex>
 
+#include "prdp/error_text.h"
 #include "prdp/gpu/cuda_driver.h"
 #include "prdp/gpu/nvrtc.h"
 
@@ -60,16 +62,39 @@ bool captures(c10::Device device) {
   return capturing != 0;
 }
 
+/// While it lives, this thread may load a kernel though another one captures a graph, which that would spoil.
+class BesideCaptures {
+ public:
+  BesideCaptures() { exchange(); }
+  BesideCaptures(const BesideCaptures&) = delete;
+  ~BesideCaptures() { CudaDriver::get().exchange_capture_mode(&mode_); }
+
+ private:
+  void exchange() { CudaDriver::get().check(CudaDriver::get().exchange_capture_mode(&mode_), "no mode of capture"); }
+  int mode_ = 2;  // CU_STREAM_CAPTURE_MODE_RELAXED; then that of before
+};
+
+/// call(), and once more where memory is short, after torch has let go of what it keeps for later: a kernel's stack is
+/// none of torch's memory, and takes some hundred megabytes.
+template <class F>
+int with_memory(c10::Device device, const F& call) {
+  const int result = call();
+  if (result != CudaDriver::kOutOfMemory || captures(device)) return result;
+  if (auto* const memory = dynamic_cast<c10::DeviceAllocator*>(c10::GetAllocator(device.type()))) memory->emptyCache();
+  return call();
+}
+
 class CudaKernel final : public Kernel {
  public:
   CudaKernel(c10::Device device, const KernelSource& source) : device_(device), source_(source) {
     const auto& driver = CudaDriver::get();
-    TORCH_CHECK(!captures(device),
-                "prdp: a kernel is to be compiled while a CUDA graph is captured; call prdp.warm_up() before");
+    TORCH_CHECK(!captures(device), "prdp: a kernel is to be compiled while a CUDA graph is captured; ",
+                in_language("call prdp.warm_up() before", "run the same once before"));
     const int capability = 10 * attribute(kCapabilityMajor, device) + attribute(kCapabilityMinor, device);
     const auto binary = nvrtc::compile(source.text, capability);
+    const BesideCaptures relaxed;
     void* module = nullptr;
-    driver.check(driver.load(&module, binary.data()), "the kernel does not load");
+    driver.check(with_memory(device, [&] { return driver.load(&module, binary.data()); }), "the kernel does not load");
     driver.check(driver.function(&function_, module, "prdp_kernel"), "the kernel does not load");
     const auto memory = static_cast<int>(source.block_memory);
     driver.check(driver.set_attribute(function_, kDynamicMemory, memory), "too much memory for a block");
@@ -86,12 +111,12 @@ class CudaKernel final : public Kernel {
     void* all[] = {const_cast<void*>(arguments)};
     const auto blocks = static_cast<unsigned>(teams * source_.blocks_of_team);
     const auto threads = static_cast<unsigned>(source_.threads), memory = static_cast<unsigned>(source_.block_memory);
-    // Blocks that wait for each other must all be at work.
-    const int result =
-        source_.blocks_of_team > 1
-            ? driver.launch_cooperative(function_, blocks, 1, 1, threads, 1, 1, memory, stream_of(device_), all)
-            : driver.launch(function_, blocks, 1, 1, threads, 1, 1, memory, stream_of(device_), all, nullptr);
-    driver.check(result, "the kernel does not start");
+    const auto start = [&] {  // blocks that wait for each other must all be at work
+      return source_.blocks_of_team > 1
+                 ? driver.launch_cooperative(function_, blocks, 1, 1, threads, 1, 1, memory, stream_of(device_), all)
+                 : driver.launch(function_, blocks, 1, 1, threads, 1, 1, memory, stream_of(device_), all, nullptr);
+    };
+    driver.check(with_memory(device_, start), "the kernel does not start");
   }
 
  private:

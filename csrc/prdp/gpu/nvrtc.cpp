@@ -49,8 +49,8 @@ bool is_driver_of_cuda_12() {
   }
 }
 
-/// Where NVRTC may be: the one that torch has loaded, beside torch's wheel, or the system's. That of the driver's
-/// version comes first.
+/// Where NVRTC may be: the one that torch has loaded, beside torch's wheel, conda's, or the system's. That of the
+/// driver's version comes first.
 std::vector<std::string> names() {
   std::vector<std::string> all;
   if (const char* named = std::getenv("PRDP_NVRTC")) return {named};
@@ -60,6 +60,8 @@ std::vector<std::string> names() {
     const std::string name = std::string("libnvrtc.so.") + version;
     all.push_back(name);
     for (const char* folder : {"cu13", "cuda_nvrtc"}) all.push_back(packages / "nvidia" / folder / "lib" / name);
+    all.push_back(packages.parent_path().parent_path() / name);  // lib/python3.11/site-packages
+    all.push_back("/usr/local/cuda/lib64/" + name);
   }
   return all;
 }

@@ -48,9 +48,10 @@ class Kernel {
   virtual ~Kernel() = default;
   /// Teams that can be at work at the same time.
   virtual int64_t teams() const = 0;
-  /// Teams for a batch. Those of several blocks meet, so all must be at work at once. Single blocks may queue.
-  int64_t teams_for(int64_t batch, int64_t blocks_of_team) const {
-    return std::min(batch, blocks_of_team > 1 ? teams() : 4 * teams());
+  /// Teams for a batch. Those of several blocks meet, so all must be at work at once; so should those with memory of
+  /// their own, of which there may be little. Others may queue.
+  int64_t teams_for(int64_t batch, int64_t blocks_of_team, bool have_memory = false) const {
+    return std::min(batch, blocks_of_team > 1 || have_memory ? teams() : 4 * teams());
   }
   /// On the device's current stream. `arguments` are what its text calls Arguments.
   virtual void launch(int64_t teams, const void* arguments) const = 0;

@@ -79,7 +79,8 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
        << "using S = HierarchySetting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << b.dim() - 2 << ", "
        << blocks << ", " << threads << ">;\n"
        << "using Arguments = HierarchyArguments<S::T>;\n"
-       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const Arguments arguments) {\n"
+       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const __grid_constant__ Arguments "
+          "arguments) {\n"
           "  make_hierarchies<S>(arguments);\n}\n";
   const int64_t weights = 4 * points, inverse = kMostOfCoarsest * kMostOfCoarsest;
   const int64_t numbers = offsets * (points + most_coarse_points(b.sizes().slice(2))) + weights + inverse;

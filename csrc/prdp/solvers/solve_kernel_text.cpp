@@ -43,7 +43,8 @@ std::string text_of(const Sizes& sizes, const OperatorView& a, const Solver& sol
   else text << "NoCycleSetting";
   text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
        << "using Arguments = SolveArguments<S::T>;\n"
-       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const Arguments arguments) {\n"
+       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const __grid_constant__ Arguments "
+          "arguments) {\n"
           "  PRDP_BLOCK_MEMORY(memory);\n"
           "  solve_batch<Method, S>(arguments, reinterpret_cast<S::T*>(memory));\n}\n";
   return text.str();

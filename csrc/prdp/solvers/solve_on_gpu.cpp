@@ -67,7 +67,8 @@ SolveResult launch(const ReadyKernel& ready, const at::Tensor& b, const SolveReq
   const auto& [kernel, spec, a, hierarchy] = ready;
   const int64_t batch = b.size(0);
   SolveResult result{at::empty(b.sizes(), b.options()), new_report(b, request.report_apart)};
-  const int64_t blocks = spec.source.blocks_of_team, teams = kernel->teams_for(batch, blocks);
+  const int64_t blocks = spec.source.blocks_of_team;
+  const int64_t teams = kernel->teams_for(batch, blocks, /*have_memory=*/spec.memory_of_team > 0);
   const TeamMemory memory(blocks, teams, b.options(), teams * spec.memory_of_team * b.element_size());
   const auto caps = request.caps ? request.caps->to(b.device(), at::kLong).contiguous() : at::Tensor();
   const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();

@@ -170,7 +170,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
       if (null_space_.count > 0) project_solution(out);  // cycles leave rounding there, which they would amplify
       return dot(v, out);
     }
-    each([&](int i) { return v[i] / a_.diagonal(i); },
+    const A a = a_;  // as in product()
+    each([&](int i) { return v[i] / a.diagonal(i); },
          [&](int i, T value) {
            out[i] = value;
            s += v[i] * value;
@@ -181,7 +182,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   bool has_preconditioner() const { return cycle_.exists(); }
 
   PRDP_NOINLINE void divide_by_diagonal(const T* x, Vector y) {
-    each([&](int i) { return x[i] / a_.diagonal(i); }, into(y));
+    const A a = a_;  // as in product()
+    each([&](int i) { return x[i] / a.diagonal(i); }, into(y));
   }
   PRDP_NOINLINE void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
     for (int64_t k = 0; k < n; ++k, std::swap(x, next)) sweep(c, x, next, omega ? omega + k : nullptr, [](int, T) {});
@@ -204,7 +206,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     T* const found = work + numbers_of_solve_damped(n);
     if (team_.leads()) solve_damped(r, g, n, std::numeric_limits<T>::epsilon() * scale, found, work);
     team_.meet();
-    for (int64_t j = 0; j < n; ++j) y[j] = shared_entry<S::kBlocks>(found, j);
+    for (int64_t j = 0; j < n; ++j) y[j] = found[j];
   }
   using Numbers::restore;
   void restore(Scalar where, const T* from, Vector to) {
@@ -236,15 +238,20 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   void product(const T* v, const Store& store) {
     ++state_->applications;
     team_.meet();
-    if constexpr (kAtOnce == 1) this->template each<1>([&](int i) { return entry_of_product(v, i); }, store);
-    else this->template each<kAtOnce>([&](int i) { return a_.product(Shared<S::kBlocks, T>{v}, i); }, store);
+    if constexpr (kAtOnce == 1) {
+      this->template each<1>([&](int i) { return entry_of_product(v, i); }, store);
+    } else {
+      const A a = a_;  // in registers; a member's members would be loaded again for each cell
+      this->template each<kAtOnce>([&](int i) { return a.product(v, i); }, store);
+    }
   }
-  PRDP_NOINLINE T entry_of_product(const T* v, int i) const { return a_.product(Shared<S::kBlocks, T>{v}, i); }
+  PRDP_NOINLINE T entry_of_product(const T* v, int i) const { return a_.product(v, i); }
   /// next = x + c - D⁻¹A x; with omega, next = next + omega (that - next). tell(i, c_i - (D⁻¹A x)_i)
   template <class Tell>
   void sweep(const T* c, const T* x, Vector next, const T* omega, const Tell& tell) {
+    const A a = a_;  // as in product()
     product(x, [&](int i, T value) {
-      const T change = c[i] - value / a_.diagonal(i);
+      const T change = c[i] - value / a.diagonal(i);
       const T plain = x[i] + change;
       if constexpr (A::kKnowsRadius) next[i] = omega ? next[i] + *omega * (plain - next[i]) : plain;
       else next[i] = plain;

@@ -65,8 +65,6 @@ struct Cycle {
   const Grids& grids() const { return hierarchy.grids[hierarchy.numbers_of_sample > 0 ? sample : 0]; }
   const T* numbers(int64_t place) const { return hierarchy.numbers + sample * hierarchy.numbers_of_sample + place; }
 
-  static auto shared(const T* v) { return Shared<S::kBlocks, T>{v}; }
-
   /// The right-hand side of a grid and two vectors, which the smoothing steps fill in turn.
   struct Vectors {
     T *b, *x, *y;
@@ -141,12 +139,10 @@ struct Cycle {
       const bool by_columns = transposed();
       T* const x = vectors.x;
       team.meet();
-      const auto given = shared(b);
       team.for_each(kFields * n, [&](int at) {
         const int i = at % n;
         T sum = 0;
-        PRDP_NO_UNROLL for (int j = 0; j < n; ++j) sum +=
-            inverse[by_columns ? j * n + i : i * n + j] * given[at - i + j];
+        PRDP_NO_UNROLL for (int j = 0; j < n; ++j) sum += inverse[by_columns ? j * n + i : i * n + j] * b[at - i + j];
         x[at] = sum;
       });
     }
@@ -209,9 +205,8 @@ struct Cycle {
       const T* const x = vectors.x;
       T* const y = vectors.y;
       team.meet();
-      const auto of_all = shared(x);
       team.for_each(n, [&](int i) {
-        const T left = b[i] - level.product(of_all, i);
+        const T left = b[i] - level.product(x, i);
         if (q == T(0)) {
           y[i] = left;
           return;
@@ -226,16 +221,14 @@ struct Cycle {
     PRDP_NOINLINE void restrict(const CoarseGrid& here, int axis, const T* fine, T* coarse) {
       const CoarsenedAxis line = line_of(here, axis);
       const Weights w = weights(here, axis, line, /*of_restriction=*/true);
-      const auto given = shared(fine);
       team.for_each(kFields * line.coarse_entries(),
-                    [&](int i) { coarse[i] = line.restricted(given, w.left, w.right, i); });
+                    [&](int i) { coarse[i] = line.restricted(fine, w.left, w.right, i); });
     }
     PRDP_NOINLINE void interpolate(const CoarseGrid& here, int axis, const T* coarse, T* fine, bool adds) {
       const CoarsenedAxis line = line_of(here, axis);
       const Weights w = weights(here, axis, line, /*of_restriction=*/false);
-      const auto given = shared(coarse);
       team.for_each(kFields * line.fine_entries(), [&](int i) {
-        const T value = line.interpolated(given, w.left, w.right, i);
+        const T value = line.interpolated(coarse, w.left, w.right, i);
         fine[i] = adds ? fine[i] + value : value;
       });
     }

@@ -143,7 +143,7 @@ struct FlowCorrection {
   T corrected(int s, int c, int axis, const FlowPlace& p, const T* of_sample) const {
     const auto& grid = u.grid;
     const auto value = [&](const FlowPlace& q) {
-      return __ldcg(of_sample + (q.at[0] * grid.n[1] + q.at[1]) * grid.n[2] + q.at[2]);
+      return of_sample[(q.at[0] * grid.n[1] + q.at[1]) * grid.n[2] + q.at[2]];
     };
     const auto before_it = grid.wrapped(p.moved(axis, -1));
     T gradient = kernels::difference(static_cast<T>(factor / grid.dx[axis]),

@@ -76,7 +76,6 @@ class HierarchyMaker {
     used_ += n;
     return taken;
   }
-  static auto shared(const T* v) { return Shared<S::kBlocks, T>{v}; }
 
   /// The coefficients of A itself.
   PRDP_NOINLINE Stencil finest(const A& a) {
@@ -98,7 +97,7 @@ class HierarchyMaker {
   /// To the last bit. It needs no barrier first: gershgorin_bound() has met since the coefficients were written.
   PRDP_NOINLINE bool is_symmetric(const Stencil& a) {
     const int n = a.points();
-    const auto entry = shared(a.coefficients);
+    const T* const entry = a.coefficients;
     T differs = 0;
     team_.for_each(n, [&](int i) {
       a.for_each_neighbour(i, [&](int k, int there) {
@@ -111,7 +110,7 @@ class HierarchyMaker {
   /// Σ_k |a_k| / |a_0|, the largest of all points; infinite where a diagonal is zero, or a number is not finite.
   PRDP_NOINLINE double gershgorin_bound(const Stencil& a) {
     const int n = a.points();
-    const auto entry = shared(a.coefficients);
+    const T* const entry = a.coefficients;
     return static_cast<double>(largest_of(team_, n, [&](int i) {
       T sum = 0;
       for (int k = 0; k < kOffsets; ++k) sum += std::abs(entry[k * n + i]);
@@ -122,7 +121,7 @@ class HierarchyMaker {
   /// Estimated from at most 8,191 of the points, an odd number apart, so that no axis shows the same places alone.
   PRDP_NOINLINE kernels::Axes axes_to_coarsen(const Stencil& a) {
     const int n = a.points(), step = (n / 4096 > 1 ? n / 4096 : 1) | 1;
-    const auto entry = shared(a.coefficients);
+    const T* const entry = a.coefficients;
     double along[4] = {}, net[4] = {};  // of each axis; and of the rows
     team_.for_each((n + step - 1) / step, [&](int place) {
       const int i = place * step;
@@ -171,7 +170,7 @@ class HierarchyMaker {
   /// part and restriction from the transpose (Dendy 1983).
   PRDP_NOINLINE void make_weights(const Stencil& a, const CoarsenedAxis& line, int axis, T* to) {
     const int n = a.points(), weights = line.weights();
-    const auto entry = shared(a.coefficients);
+    const T* const entry = a.coefficients;
     team_.for_each(weights, [&](int w) {
       const int i = point_of_weight(line, w);
       T own[3] = {}, of_transpose[3] = {};
@@ -220,14 +219,13 @@ class HierarchyMaker {
   /// The weights by which a coarse point meets the column of fine points at this offset.
   kernels::GalerkinPoint<T> weights_of_column(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights,
                                               const CoarsePoint& at, const int (&offset)[3]) const {
-    const auto weight = shared(weights);
     const int of_left = 0, of_right = line.weights(), restriction = symmetric_ ? 0 : 2 * line.weights();
     const auto restrict_by = [&](int field, int between) {
-      return weight[restriction + field + line.weight_of(at.outer, between, at.inner)];
+      return weights[restriction + field + line.weight_of(at.outer, between, at.inner)];
     };
     const auto interpolate_by = [&](int field, int between) {
       const int index = weight_of_column(a, line, axis, at.fine[1], offset, between);
-      return index < 0 ? T(0) : weight[field + index];
+      return index < 0 ? T(0) : weights[field + index];
     };
     kernels::GalerkinPoint<T> made;
     if (at.before >= 0) {
@@ -248,7 +246,7 @@ class HierarchyMaker {
                          T* to) const {
     const CoarsePoint at(line, i);
     const int n = a.points();
-    const auto entry = shared(a.coefficients);
+    const T* const entry = a.coefficients;
     const auto coefficient = [&](int place, int p) { return entry[place * n + at.fine[p]]; };
     for_each_column(axis, [&](int centre, const int (&offset)[3]) {
       auto made = weights_of_column(a, line, axis, weights, at, offset);
@@ -282,7 +280,7 @@ class HierarchyMaker {
     if (team_.leads()) grids_.inverse = inverse - numbers_;
     T largest = 0;
     if (team_.is_first_block()) {
-      const auto entry = shared(a.coefficients);
+      const T* const entry = a.coefficients;
       for (int i = static_cast<int>(threadIdx.x); i < n; i += S::kThreads) {
         for (int j = 0; j < n; ++j) work_[i * n + j] = 0;
         a.for_each_neighbour(i, [&](int k, int there) {

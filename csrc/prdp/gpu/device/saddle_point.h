@@ -22,22 +22,20 @@ struct SaddlePoint {
   PRDP_NOINLINE void apply(const T* r, T* z) const {
     T *const c = memory[3], *const p = memory[4] + kVelocity;
     team.meet();
-    const Shared<S::kBlocks, T> given{r};
-    team.for_each(kPressure, [&](int i) { c[kVelocity + i] = given[kVelocity + i]; });
+    team.for_each(kPressure, [&](int i) { c[kVelocity + i] = r[kVelocity + i]; });
     solve_schur(c + kVelocity, p);
     team.meet();
-    const Part pressure{{memory[4]}, /*is_pressure=*/true};
-    team.for_each(kVelocity, [&](int i) { c[i] = given[i] - product(pressure, i); });
+    const Part pressure{memory[4], /*is_pressure=*/true};
+    team.for_each(kVelocity, [&](int i) { c[i] = r[i] - product(pressure, i); });
     const T* const u = solve_velocity(c);
     team.meet();  // each thread has other cells of the whole vector than of its parts
-    const Shared<S::kBlocks, T> velocity{u};
-    team.for_each(A::kUnknowns, [&](int i) { z[i] = i < kVelocity ? velocity[i] : pressure.v[i]; });
+    team.for_each(A::kUnknowns, [&](int i) { z[i] = i < kVelocity ? u[i] : pressure.v[i]; });
   }
 
  private:
   /// A vector of which one part is zero.
   struct Part {
-    Shared<S::kBlocks, T> v;
+    const T* v;
     bool is_pressure;
     T operator[](int i) const { return (i >= kVelocity) == is_pressure ? v[i] : T(0); }
   };
@@ -58,7 +56,7 @@ struct SaddlePoint {
     constexpr int64_t sweeps_per_smoothing = 2;
     PRDP_NO_UNROLL for (int64_t s = 1; s < sweeps_per_smoothing * cycle.hierarchy.smoothing; ++s, std::swap(x, next)) {
       team.meet();
-      const Part velocity{{x}, /*is_pressure=*/false};
+      const Part velocity{x, /*is_pressure=*/false};
       team.for_each(kVelocity, [&](int i) { next[i] = x[i] + (c[i] - product(velocity, i)) / diagonal[i]; });
     }
     return x;

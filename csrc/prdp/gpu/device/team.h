@@ -13,19 +13,6 @@ inline constexpr int kWarp = 32;
 /// Several loads are under way before the first of their values is needed.
 inline constexpr int kCellsAtOnce = 4;
 
-/// An entry that another thread of the team wrote. Those of other blocks are not in this block's cache.
-template <int blocks, class T>
-T shared_entry(const T* v, int64_t i) {
-  if constexpr (blocks > 1) return __ldcg(v + i);
-  else return v[i];
-}
-/// A vector of such entries.
-template <int blocks, class T>
-struct Shared {
-  const T* v;
-  T operator[](int i) const { return shared_entry<blocks>(v, i); }
-};
-
 /// The threads of a block, or of several blocks that meet in memory. Each thread owns the same cells throughout, so
 /// what it alone writes and reads needs no barrier.
 template <int kBlocks, int kThreads>
@@ -60,7 +47,8 @@ class Team {
     PRDP_NO_UNROLL for (int i = mine.begin + static_cast<int>(threadIdx.x); i < mine.end; i += kThreads) f(i);
   }
 
-  /// Waits for all threads of the team, and sees what they wrote. Tests leave out the one of a line, and must notice.
+  /// Waits for all threads of the team, and sees what they wrote: the fences empty the block's cache. Tests leave out
+  /// the one of a line, and must notice.
   void meet([[maybe_unused]] int line = __builtin_LINE()) {
     if (PRDP_LEAVES_OUT(line)) return;
     __syncthreads();
@@ -134,14 +122,19 @@ class Team {
   template <int n, class T, class Join>
   void over_blocks(T (&s)[n], const Join& join) {
     __shared__ T whole[2][kMostAtOnce];
-    volatile double* parts = parts_ + turn_ * kBlocks * kMostAtOnce;
+    double* const parts = parts_ + turn_ * kBlocks * kMostAtOnce;
     if (threadIdx.x == 0)
       for (int k = 0; k < n; ++k) parts[rank_ * kMostAtOnce + k] = static_cast<double>(s[k]);
     meet();
-    if (const int k = static_cast<int>(threadIdx.x); k < n) {
-      T v = static_cast<T>(parts[k]);
-      for (int block = 1; block < kBlocks; ++block) v = join(v, static_cast<T>(parts[block * kMostAtOnce + k]));
-      whole[turn_][k] = v;
+    if (const int lane = static_cast<int>(threadIdx.x); lane < kWarp) {
+      T of_lane[n];
+      PRDP_UNROLL for (int k = 0; k < n; ++k) of_lane[k] = T(0);
+      PRDP_UNROLL for (int first = 0; first < kBlocks; first += kWarp) PRDP_UNROLL for (int k = 0; k < n; ++k) {
+        const int block = first + lane;
+        of_lane[k] = join(of_lane[k], block < kBlocks ? static_cast<T>(parts[block * kMostAtOnce + k]) : T(0));
+      }
+      for (int k = 0; k < n; ++k)
+        if (const T all = over_warp(of_lane[k], join); lane == 0) whole[turn_][k] = all;
     }
     __syncthreads();
     for (int k = 0; k < n; ++k) s[k] = whole[turn_][k];
