@@ -165,10 +165,12 @@ def _diagonal(A: Operator, v: Tensor) -> Iterator[str]:
 
 
 def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Iterator[str]:
-    found = _C.product_rule(w, v, A.tensors, A.kind, A.shape, A.parameters)
-    null_spaces = 2 if A.kind.startswith("singular_") else 0  # which have no gradient
-    for i, (t, gradient) in enumerate(zip(A.tensors, found, strict=True)):
-        if not t.is_floating_point() or i >= len(A.tensors) - null_spaces:
+    kind, given = A.kind.removeprefix("singular_"), A.tensors
+    if kind != A.kind:
+        given = given[:-2]  # without its null spaces, which need not be those of the operator that is changed
+    found = _C.product_rule(w, v, given, kind, A.shape, A.parameters)
+    for i, (t, gradient) in enumerate(zip(given, found, strict=True)):
+        if not t.is_floating_point():
             continue
         eps = max(torch.finfo(v.dtype).eps, torch.finfo(t.dtype).eps)
         largest = t.abs().max().item() if t.numel() else 0.0
@@ -176,8 +178,8 @@ def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Itera
         direction = _noise(t, generator)
 
         def product(s: float, i: int = i, t: Tensor = t, direction: Tensor = direction) -> Tensor:
-            tensors = [t + s * direction if j == i else other for j, other in enumerate(A.tensors)]
-            changed: Tensor = torch.ops.prdp.apply(v, tensors, A.kind, A.shape, A.parameters, False)
+            tensors = [t + s * direction if j == i else other for j, other in enumerate(given)]
+            changed: Tensor = torch.ops.prdp.apply(v, tensors, kind, A.shape, A.parameters, False)
             return changed
 
         forward, backward = product(step), product(-step)

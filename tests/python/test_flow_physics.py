@@ -165,3 +165,16 @@ def test_taylor_green_vortices_decay_at_first_order_towards_the_exact_rate():
         exact = math.exp(-8 * math.pi**2 * nu * final) * u
         errors.append(float((u_end - exact)[:, :2].abs().max()) / amplitude)
     assert errors[-1] < 0.04 and orders(errors)[-1] > 0.8
+
+
+def test_a_mean_velocity_that_float32_would_lose_is_refused():
+    """Where nothing but 1, beside coefficients of 1e7, holds it."""
+    settings = {"nu": 3000.0, "dt": 1.0, "force": (1e-6, 0.0)}
+    u = torch.zeros(1, 2, 32, 32)
+    periodic = prdp.Flow((32, 32), **settings)
+    with pytest.raises(ValueError, match=r"float32 loses the mean velocity of a periodic box .* got 1.2288e\+07"):
+        periodic(u)
+    mean = periodic(u.double())[0, 0].mean().item()
+    assert abs(mean - 1e-6) < 1e-11
+    held = prdp.Flow((32, 32), boundary="wall", **settings)
+    assert held(u).isfinite().all()

@@ -162,3 +162,30 @@ def test_a_constant_that_appears_later_is_refused_too():
     solve(0.0)
     with pytest.raises(ValueError, match=r"matvec\(0\) holds ±0.1"):
         solve(0.1)
+
+
+@pytest.mark.parametrize("method", [prdp.CG(20), prdp.GMRES(20), prdp.BiCGStab(20), prdp.MINRES(20), prdp.Direct()])
+def test_inference_mode_looks_at_the_transpose_as_well(method):
+    """By a product that autograd records, which it does not by itself there."""
+    b = torch.randn(2, 1, 8, dtype=torch.float64)
+    b = b - b.mean(-1, keepdim=True)
+
+    def solve():
+        weight = torch.full((8,), 2.0, dtype=torch.float64)
+        a = operators.Function(
+            lambda v, w: w * v - v.roll(1, -1) - v.roll(-1, -1), nullspace="constant", tensors=[weight]
+        )
+        return prdp.linear_solve(a, b, method)[0], prdp.check_operator(a, b)
+
+    expected, _ = solve()
+    with torch.inference_mode():
+        found, is_right = solve()
+    assert is_right and torch.equal(found, expected)
+
+
+def test_inference_mode_names_a_tensor_that_autograd_cannot_record():
+    with torch.inference_mode():
+        weight, b = torch.full((8,), 2.0), torch.ones(1, 1, 8)
+        a = operators.Function(lambda v: weight * v)
+        with pytest.raises(RuntimeError, match="Inference tensors cannot be saved for backward"):
+            a.apply_transpose(b)

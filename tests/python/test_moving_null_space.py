@@ -155,3 +155,28 @@ def test_vectors_of_a_channel_and_of_all_channels_move(of_all_channels):
     cotangent = torch.linspace(-1, 2, 30, dtype=F64).view(3, 2, 5)
     found, expected = (torch.autograd.grad(u(scale), scale, cotangent)[0] for u in (mine, exact))
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9)
+
+
+@modes
+@pytest.mark.parametrize("moving", ["left", "right"])
+def test_the_other_null_space_may_be_the_constant(moving, backward):
+    """Rows of a ring, or columns, whose sums are zero, each times a weight."""
+    n, generator = 7, torch.Generator().manual_seed(3)
+    weights = (torch.rand(1, n, dtype=F64, generator=generator) + 0.5).requires_grad_()
+    f = torch.randn(2, 1, n, dtype=F64, generator=generator)
+    ones = torch.ones(1, n, dtype=F64)
+
+    def by(constant):
+        def solution(weights):
+            of_neighbours = [1 / weights.roll(step, -1) for step in (1, -1)] if moving == "right" else [1 / weights] * 2
+            c = torch.stack([2 / weights, *(-c for c in of_neighbours)], 1)
+            bases = (constant, weights) if moving == "left" else (weights, constant)
+            left = weights if moving == "left" else ones
+            b = f - (f * left).sum(-1, keepdim=True) * left / left.square().sum()
+            a = operators.Stencil(c, [(0,), (-1,), (1,)], "periodic", nullspace=bases[0], left_nullspace=bases[1])
+            return prdp.linear_solve(a, b, SOLVERS["gmres"], backward=backward)[0]
+
+        return solution
+
+    torch.testing.assert_close(by("constant")(weights), by(ones)(weights), rtol=1e-10, atol=1e-11)
+    assert torch.autograd.gradcheck(by("constant"), weights)

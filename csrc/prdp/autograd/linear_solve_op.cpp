@@ -133,7 +133,8 @@ SolveOutputs solve_and_differentiate_null_space(const at::Tensor& b, const Opera
   auto fixed = a;
   for (size_t k = 0; k < 2; ++k) fixed.tensors[a.tensors.size() - 2 + k] = without_derivative(bases[k]);
   auto out = solve_with_node(b, fixed, options, x0);
-  std::get<0>(out) = follow_null_space(std::get<0>(out), bases[a.transposed]);
+  if (const auto& basis = bases[a.transposed]; any_needs_derivative(basis))
+    std::get<0>(out) = follow_null_space(std::get<0>(out), basis);
   return out;
 }
 

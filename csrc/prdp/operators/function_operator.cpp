@@ -175,9 +175,9 @@ at::Tensor FunctionOperator::derivative_transposed(const at::Tensor& v) const {
 
 at::Tensor FunctionOperator::diagonal() const {
   const auto& function = registered_->products().diagonal;
-  TORCH_CHECK_VALUE(function,
-                    "Function: its diagonal, which Jacobi and preconditioner=\"diagonal\" divide by, is not "
-                    "known; give diagonal, or take another method");
+  TORCH_CHECK_VALUE(function, "Function: its diagonal, which Jacobi and ",
+                    in_language("preconditioner=\"diagonal\"", "Preconditioner::diagonal()"),
+                    " divide by, is not known; give diagonal, or take another method");
   const auto found = function(tensors_);
   TORCH_CHECK_TYPE(found.defined() && at::isFloatingType(found.scalar_type()),
                    "Function: diagonal must return a real tensor");
@@ -210,18 +210,18 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
     std::vector<int64_t> wanted;
     for (const auto& t : tensors_) {
       const bool recorded = create_graph && t.requires_grad();
-      arguments.push_back(recorded ? t.view_as(t) : holds_numbers(t) ? t.detach().requires_grad_() : t);
+      arguments.push_back(recorded ? t.view_as(t) : holds_numbers(t) ? detached(t).requires_grad_() : t);
       wanted.push_back(arguments.back().requires_grad());
     }
     if (std::find(wanted.begin(), wanted.end(), 1) == wanted.end()) return std::vector<at::Tensor>(tensors_.size());
-    const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, product_name());
+    const auto made = product(registered_->products().apply, create_graph ? u : detached(u), arguments, product_name());
     if (!made.requires_grad()) check_is_recorded(u);
     return gradients_of({made}, {create_graph ? lambda : lambda.detach()}, arguments, wanted, create_graph);
   });
 }
 
 void FunctionOperator::check_is_recorded(const at::Tensor& u) const {
-  const auto v = u.detach().requires_grad_();
+  const auto v = detached(u).requires_grad_();
   TORCH_CHECK_VALUE(product(registered_->products().apply, v, detached(tensors_), product_name()).requires_grad(),
                     "Function: torch does not record ", product_name(),
                     ", so that its tensors would get no gradient; make it of torch operations, without ",

@@ -99,9 +99,13 @@ inline void add_to(at::Tensor& sum, const at::Tensor& term) {
   if (term.defined()) sum = sum.defined() ? sum + term : term;
 }
 
+/// t without its history, for autograd to record anew, which saves no tensors of inference mode.
+inline at::Tensor detached(const at::Tensor& t) {
+  return t.is_inference() && !c10::InferenceMode::is_enabled() ? t.clone() : t.detach();
+}
 inline std::vector<at::Tensor> detached(at::TensorList tensors) {
   std::vector<at::Tensor> plain;
-  for (const auto& t : tensors) plain.push_back(t.detach());
+  for (const auto& t : tensors) plain.push_back(detached(t));
   return plain;
 }
 

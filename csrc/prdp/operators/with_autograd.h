@@ -1,16 +1,20 @@
 #pragma once
 #include <ATen/ATen.h>
 #include <ATen/core/grad_mode.h>
+#include <c10/core/InferenceMode.h>
 #include <torch/csrc/autograd/autograd.h>
 
+#include <optional>
 #include <vector>
 
 namespace prdp {
 
-/// Runs body() recorded by autograd: an op may run where that is switched off, inside a compiled graph
-/// for one.
+/// Runs body() recorded by autograd: an op may run where that is switched off, as inside a compiled graph or in
+/// inference mode.
 template <class Body>
 auto with_autograd(const Body& body) {
+  std::optional<c10::InferenceMode> recorded;
+  if (c10::InferenceMode::is_enabled()) recorded.emplace(false);
   const auto keys = c10::impl::tls_local_dispatch_key_set();
   const c10::impl::ForceDispatchKeyGuard guard(keys.included_,
                                                keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);

@@ -44,7 +44,7 @@ FlowBox::FlowBox(std::vector<int64_t> shape, const std::vector<FlowBoundary>& bo
   for (const double side : length_)
     TORCH_CHECK_VALUE(std::isfinite(side) && side > 0, "Flow: length must be finite and > 0, got ", side);
   TORCH_CHECK_VALUE(std::count(boundary_.begin(), boundary_.end(), FlowBoundary::kOpen) <= 1,
-                    "Flow: at most one axis may be 'open'");
+                    "Flow: at most one axis may be open");
   const c10::InferenceMode may_be_recorded_later(false);
   if (obstacle_.defined()) {
     TORCH_CHECK_TYPE(obstacle_.scalar_type() == at::kBool,
@@ -59,6 +59,11 @@ FlowBox::FlowBox(std::vector<int64_t> shape, const std::vector<FlowBoundary>& bo
 int64_t FlowBox::open_axis() const {
   const auto found = std::find(boundary_.begin(), boundary_.end(), FlowBoundary::kOpen);
   return found == boundary_.end() ? -1 : found - boundary_.begin();
+}
+
+bool FlowBox::is_held() const {
+  const auto holds = [](FlowBoundary boundary) { return boundary != FlowBoundary::kPeriodic; };
+  return obstacle_.defined() || std::any_of(boundary_.begin(), boundary_.end(), holds);
 }
 
 double FlowBox::sum_of_couplings() const {

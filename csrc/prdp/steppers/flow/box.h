@@ -56,6 +56,8 @@ class FlowBox {
   /// The axis with an inflow, or -1.
   int64_t open_axis() const;
   int64_t channel_of(int64_t axis) const { return dim() - 1 - axis; }
+  /// Whether walls, obstacles or an inflow hold the mean velocity.
+  bool is_held() const;
   /// Σ_axes 2 / dx².
   double sum_of_couplings() const;
 

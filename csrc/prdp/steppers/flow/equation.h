@@ -48,6 +48,10 @@ struct FlowEquation {
   FlowEquation with_tensors(at::TensorList tensors) const;
   /// The velocity of the wall at an end of an axis; undefined at rest.
   at::Tensor velocity_of_wall(int64_t axis, bool high) const;
+
+ private:
+  /// check(); returns nu dt Σ 2/dx².
+  double checked_diffusion_number() const;
 };
 
 /// "wall_velocity of side (0, 'high')", for the i-th of FlowEquation::wall_velocity.
