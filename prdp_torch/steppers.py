@@ -137,11 +137,10 @@ class EquationStepper(HoldsTensors, Stepper):
     def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, channel, *shape).
 
-        Values and gradients equal those of single calls bit for bit. A rollout is faster, because it is one
-        operation with one backward pass. `info` and `adjoint_info` then hold tensors of shape (batch, steps). If
-        a step fails, the error gives its number, counted from 1. The backward pass needs the states; in implicit
-        mode `Poisson`, and `Heat` with a number as nu, need nothing. Where a subclass has a forward of its own, or
-        there are hooks, it repeats the calls of the module."""
+        Values and gradients equal those of single calls bit for bit. A rollout is faster: it is one operation with one
+        backward pass. `info` and `adjoint_info` then hold tensors of shape (batch, steps). If a step fails, the error
+        gives its number, counted from 1. The backward pass needs the states; in implicit mode `Poisson`, and `Heat`
+        with a number as nu, need nothing. A module with hooks, or a forward of its own, repeats its calls."""
         if self._calls_do_more_than(EquationStepper.forward):
             return super().rollout(u, steps)
         if not torch.compiler.is_compiling():

@@ -107,4 +107,19 @@ TEST(Failures, AreCountedAndNamed) {
             "solve");
 }
 
+TEST(Warnings, GoToASinkAndBack) {
+  static int taken;
+  taken = 0;
+  auto heat = prdp::Heat({9}, 0.1, 1.0, prdp::CG{.max_iter = 9});
+  heat.options().on_failure = prdp::OnFailure::kWarn;
+  const auto bad = at::full({1, 1, 9}, NAN);
+  prdp::set_warning_sink([](const std::string&) { ++taken; });
+  heat(bad);
+  prdp::set_warning_sink(nullptr);
+  testing::internal::CaptureStderr();
+  heat(bad);
+  EXPECT_NE(testing::internal::GetCapturedStderr().find("NONFINITE_INPUT"), std::string::npos);
+  EXPECT_EQ(taken, 1);
+}
+
 }  // namespace

@@ -239,13 +239,45 @@ TEST(LinearSolve, ACsrMatrixHasTheGradientOfItsValues) {
 
 TEST(LinearSolve, ADiffusionTakesEverythingWithANumberAsShift) {
   const auto kappa = at::rand({1, 5}, at::kDouble) + 1.0, h = at::scalar_tensor(2.0, at::kDouble);
-  const std::vector<std::array<prdp::Side, 2>> sides{{prdp::Side::kRobin, prdp::Side::kZero}};
+  const std::vector<prdp::Sides> sides{{prdp::Side::kRobin, prdp::Side::kZero}};
   const auto b = at::rand({1, 1, 5}, at::kDouble);
   const auto solve = [&](const auto& shift) {
     const auto a = prdp::diffusion(kappa, shift, sides, {1.0}, prdp::FaceMean::kArithmetic, {h});
     return prdp::linear_solve(a, b, {prdp::Direct{}}).u;
   };
   EXPECT_TRUE(at::equal(solve(10.0), solve(at::scalar_tensor(10.0, at::kDouble))));
+}
+
+TEST(Diffusion, OneSideAloneIsBothOfItsAxis) {
+  using prdp::Side;
+  const auto kappa = at::rand({1, 4, 5}, at::kDouble) + 1.0, u = at::rand({1, 1, 4, 5}, at::kDouble);
+  const auto product = [&](const std::vector<prdp::Sides>& sides) {
+    return prdp::make_operator(prdp::diffusion(kappa, 0.0, sides))->apply(u);
+  };
+  const auto of_flux = product({{Side::kFlux, Side::kFlux}, {Side::kFlux, Side::kFlux}});
+  EXPECT_LT(of_flux.sum().abs().item<double>(), 1e-12);
+  for (const auto& sides : std::vector<std::vector<prdp::Sides>>{
+           {{Side::kFlux}}, {Side::kFlux}, {{Side::kFlux}, {Side::kFlux}}, {Side::kFlux, Side::kFlux}})
+    EXPECT_TRUE(at::equal(product(sides), of_flux));
+  EXPECT_FALSE(at::equal(product({{Side::kFlux, Side::kZero}}), of_flux));
+}
+
+TEST(Operators, WhatIsMissingIsNamed) {
+  const at::Tensor none;
+  const auto said = [](const auto& make) -> std::string {
+    try {
+      make();
+    } catch (const c10::ValueError& error) {
+      return error.what_without_backtrace();
+    }
+    return "nothing";
+  };
+  EXPECT_EQ(said([&] { prdp::diffusion(none, 0.0); }), "Diffusion: kappa is an undefined tensor");
+  const auto closed = prdp::diffusion(at::ones({1, 4}), 0.0, {prdp::Side::kFlux});
+  EXPECT_EQ(said([&] { prdp::with_null_space(closed); }), "with_null_space: the operator has a null space already");
+  const prdp::OperatorSpec bare{"function", {}, {}, {}};
+  EXPECT_EQ(said([&] { prdp::linear_solve(bare, at::ones({1, 4}), {prdp::CG{.max_iter = 1}}); }),
+            "Function: its operator must come from spec() of RegisteredProducts");
 }
 
 }  // namespace

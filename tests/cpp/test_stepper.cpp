@@ -1,6 +1,7 @@
 #include <gtest/gtest.h>
 #include <torch/csrc/autograd/autograd.h>
 
+#include <functional>
 #include <limits>
 
 #include "helpers.h"
@@ -254,6 +255,43 @@ TEST(Stepper, RefusesBadArgumentsBeforeAnyWork) {
   EXPECT_THROW(prdp::NavierStokes({8}, 1e-3, 0.1, prdp::Direct{}), c10::ValueError);
   auto flow = prdp::NavierStokes({4, 5}, 1e-3, 0.1, prdp::Direct{});
   EXPECT_THROW(flow(at::zeros({2, 2, 4, 5})), c10::ValueError);
+}
+
+/// The words of what f() raises.
+template <class F>
+std::string said(const F& f) {
+  try {
+    f();
+  } catch (const c10::ValueError& error) {
+    return error.what_without_backtrace();
+  }
+  return "nothing";
+}
+
+TEST(Stepper, WhatMakesNoStepSaysWhy) {
+  const auto u = at::ones({1, 1, 8}, at::kDouble);
+  const prdp::Solver cg = prdp::CG{.max_iter = 20};
+  auto heat = prdp::Heat({8}, 1e-2, 1.0, cg);
+  EXPECT_EQ(said([&] { heat(at::Tensor()); }), "heat: u is an undefined tensor");
+  EXPECT_EQ(said([&] { heat.rollout(u.to_sparse(), 2); }), "heat: u must be a dense tensor, got the layout Sparse");
+  EXPECT_EQ(said([&] { prdp::Heat({8}, 1e-2, 1.0, prdp::CG{}); }), "heat: max_iter must be given, as a number >= 0");
+
+  auto step = prdp::ImplicitStep(prdp::diffusion(at::ones({1, 8}, at::kDouble)), nullptr, cg);
+  auto flow = prdp::Flow({8, 8}, 1e-2, 1e-3);
+  const auto moved_step = std::move(step);
+  auto moved_flow = std::move(flow);
+  const std::string moved = "a stepper that was moved from makes no steps";
+  EXPECT_EQ(said([&] { step(u); }), moved);
+  EXPECT_EQ(said([&] { step.rollout(u, 2); }), moved);
+  EXPECT_EQ(said([&] { flow(u); }), moved);
+  EXPECT_NE(said([&] { flow.project(u); }).find("one that was moved from has none"), std::string::npos);
+
+  moved_flow.options().start = prdp::Start::kState;
+  const auto velocity = at::zeros({1, 2, 8, 8}, at::kDouble);
+  for (const auto& call :
+       std::vector<std::function<void()>>{[&] { moved_flow(velocity); }, [&] { moved_flow.rollout(velocity, 2); },
+                                          [&] { moved_flow.step_and_pressure(velocity); }})
+    EXPECT_EQ(said(call), "Flow: start must be Start::kZero: its solves are for changes");
 }
 
 }  // namespace

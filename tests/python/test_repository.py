@@ -54,6 +54,12 @@ def test_no_tracked_file_is_large():
     assert large <= {"tests/data/heat2d.npz"}
 
 
+def test_a_source_file_fits_in_a_head():
+    lines = {path: len(path.read_text().splitlines()) for path in tracked("*.h", "*.cpp", "*.py")}
+    assert len(lines) > 700
+    assert not {str(path.relative_to(ROOT)): n for path, n in lines.items() if n > 350}
+
+
 def test_pictures_have_no_alpha_channel():
     """It is a quarter of their pixels and says nothing."""
     pictures = tracked("*.png")

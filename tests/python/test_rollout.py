@@ -301,22 +301,35 @@ def test_bad_arguments_are_refused_in_words(call, error, message):
         call(prdp.Heat((9,), 1e-3, 1.0, solver=prdp.Jacobi(3)), field((9,)))
 
 
-def test_a_rollout_holds_its_states_once():
-    """By the bytes that torch allocates: the states, beside at most three fields of the step at work."""
-    state, steps = torch.randn(1, 1, 64, 64), 20
-    heat = prdp.Heat((64, 64), 1e-3, 1.0, solver=prdp.CG(4))
-    heat.rollout(state, 1)
+def most_fields(call, numbers):
+    """The most memory of torch that is held meanwhile, in fields of so many numbers in float32."""
+    with torch.profiler.profile(profile_memory=True) as profile:
+        call()
+    held = most = 0
+    for event in profile.profiler.kineto_results.events():
+        if event.name() == "[memory]":
+            held += event.nbytes()
+            most = max(most, held)
+    return most / (4 * numbers)
 
-    def peak(call):
-        with torch.profiler.profile(profile_memory=True) as profile:
-            call()
-        held = most = 0
-        for event in profile.profiler.kineto_results.events():
-            if event.name() == "[memory]":
-                held += event.nbytes()
-                most = max(most, held)
-        return most / (state.numel() * 4)
 
-    assert steps + 1 <= peak(lambda: heat.rollout(state, steps)) < steps + 4
-    u = heat.rollout(state.requires_grad_(), steps)
-    assert peak(lambda: u.backward(torch.ones(()).expand(u.shape))) < 5
+HELD = {  # with the fields of a step at work, forward and back
+    "heat": (lambda: prdp.Heat((24, 24), 1e-3, 1.0, solver=prdp.CG(4)), 1, 3, 5),
+    "flow": (lambda: prdp.Flow((24, 24), nu=1e-3, dt=1e-2, solver=prdp.CG(4), on_failure="return"), 2, 9, 10),
+}
+
+
+@pytest.mark.parametrize("way", ["loops", "kernels"])
+@pytest.mark.parametrize("name", HELD)
+def test_a_rollout_holds_its_states_once(name, way):
+    """And no more for a longer one, forward and back."""
+    make, channels, forward, back = HELD[name]
+    step, steps = make(), 20
+    state = (0.1 * torch.randn(1, channels, 24, 24)).requires_grad_()
+    with Fibers(poison=False) if way == "kernels" else contextlib.nullcontext():
+        step.rollout(state, 1).sum().backward()
+        made = []
+        states_and_work = most_fields(lambda: made.append(step.rollout(state, steps)), state.numel())
+        assert steps + 1 <= states_and_work < steps + 1 + forward
+        cotangent = torch.ones(()).expand(made[0].shape)
+        assert most_fields(lambda: made[0].backward(cotangent), state.numel()) < back

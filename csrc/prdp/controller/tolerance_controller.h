@@ -40,7 +40,7 @@ class ToleranceController final : public Controller {
   const char* name() const override { return "ToleranceController"; }
   const char* metric_name() const override { return "error"; }
   const char* remedy() const override {
-    return "raise maximum, or take a solver that needs fewer iterations, as with preconditioner=\"multigrid\", or "
+    return "raise maximum, or take a solver that needs fewer iterations, as with the preconditioner multigrid, or "
            "float64 if it stalls";
   }
   bool stalled() const override { return true; }  // not used: its metric is the error

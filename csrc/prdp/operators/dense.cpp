@@ -72,7 +72,7 @@ void check_dense_fits(const at::Tensor& b, int64_t n, int64_t matrices) {
   constexpr int64_t most_unknowns = 4096, most_numbers = int64_t{1} << 26, few_unknowns = 256;
   if (b.is_cpu()) return;
   constexpr const char* instead =
-      "take CG (if A is symmetric) or GMRES, with preconditioner=\"multigrid\" where the operator has it, or solve on "
+      "take CG (if A is symmetric) or GMRES, with the preconditioner multigrid where the operator has it, or solve on "
       "the CPU";
   TORCH_CHECK_NOT_IMPLEMENTED(
       n <= most_unknowns && matrices * n * n <= most_numbers, "linear_solve: Direct on ", b.device(),

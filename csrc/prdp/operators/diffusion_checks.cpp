@@ -47,9 +47,11 @@ at::Tensor zero_samples(const at::Tensor& t) {
 
 }  // namespace
 
-OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const std::vector<std::array<Side, 2>>& sides,
+OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const std::vector<Sides>& sides,
                        const std::vector<double>& lengths, FaceMean faces, const std::vector<at::Tensor>& robin,
                        bool per_axis) {
+  TORCH_CHECK_VALUE(kappa.defined() && shift.defined(), "Diffusion: ", kappa.defined() ? "shift" : "kappa",
+                    " is an undefined tensor");
   const int64_t axes = kappa.dim() - 1 - static_cast<int64_t>(per_axis);
   TORCH_CHECK_VALUE(axes >= 1 && axes <= 3, "Diffusion: kappa must have shape (batch or 1, ", per_axis ? "axes, " : "",
                     "*shape) with 1 to 3 axes in shape, got ", kappa.sizes());
@@ -61,14 +63,16 @@ OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const s
   OperatorSpec spec{
       per_axis ? "diffusion_per_axis" : "diffusion", kappa.sizes().slice(kappa.dim() - axes).vec(), {}, {kappa, shift}};
   spec.tensors.insert(spec.tensors.end(), robin.begin(), robin.end());
-  for (size_t d = 0; d < dim; ++d)
-    for (const auto side : sides[sides.size() == 1 ? 0 : d]) spec.parameters.push_back(static_cast<double>(side));
+  for (size_t d = 0; d < dim; ++d) {
+    const auto& [low, high] = sides[sides.size() == 1 ? 0 : d];
+    spec.parameters.insert(spec.parameters.end(), {static_cast<double>(low), static_cast<double>(high)});
+  }
   for (size_t d = 0; d < dim; ++d) spec.parameters.push_back(lengths[lengths.size() == 1 ? 0 : d]);
   spec.parameters.push_back(static_cast<double>(faces));
   [[maybe_unused]] const DiffusionOperator checks_the_rest(spec);
   bool held = shift.dim() > 0 || shift.item<double>() != 0.0;
   for (const auto& axis : sides)
-    for (const auto side : axis) held = held || side == Side::kZero || side == Side::kRobin;
+    for (const auto side : {axis.low, axis.high}) held = held || side == Side::kZero || side == Side::kRobin;
   if (held) return spec;
   return with_null_space(std::move(spec), at::empty({0}, kappa.options()));
 }

@@ -10,6 +10,12 @@ namespace prdp {
 /// What holds at one side of the box: u = 0 on it, half a cell from the nearest centre; no flux through it; the other
 /// side follows, for both sides of an axis; or what flows out, -κ ∂u/∂n, is h u.
 enum class Side { kZero, kFlux, kPeriodic, kRobin };
+/// The sides of an axis, at its low and its high end; one alone is both.
+struct Sides {
+  Sides(Side both) : Sides(both, both) {}
+  Sides(Side low, Side high) : low(low), high(high) {}
+  Side low, high;
+};
 /// How the coefficient on a face is made of those of its two cells.
 enum class FaceMean { kHarmonic, kArithmetic };
 
@@ -19,21 +25,21 @@ enum class FaceMean { kHarmonic, kArithmetic };
 /// kappa: (batch or 1, *shape) with 1 to 3 axes in shape, the values in the centres of the cells, > 0; with `per_axis`
 /// (batch or 1, axes, *shape), where ∂(κ_d ∂u/∂x_d)/∂x_d has the κ of its own axis, in the order of shape. shift: a
 /// 0-dimensional tensor or (batch or 1, *shape). Both get gradients, which for kappa are formed from differences of u
-/// and not from coefficients, so that rounding does not grow with the number of cells. sides: (low, high) for each
-/// axis, or one pair for all. lengths: of the box, for each axis or one for all. robin: h >= 0 of each such side in
-/// their order, 0-dimensional or (batch or 1, *side), where side is shape without the axis; it gets a gradient. Raises
-/// ValueError if these do not fit together.
+/// and not from coefficients, so that rounding does not grow with the number of cells. sides: of each axis, or of all:
+/// {{Side::kFlux}}, {{Side::kZero, Side::kFlux}, Side::kPeriodic}. lengths: of the box, for each axis or one for all.
+/// robin: h >= 0 of each such side in their order, 0-dimensional or (batch or 1, *side), where side is shape without
+/// the axis; it gets a gradient. Raises ValueError if these do not fit together.
 OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift,
-                       const std::vector<std::array<Side, 2>>& sides = {{Side::kZero, Side::kZero}},
-                       const std::vector<double>& lengths = {1.0}, FaceMean faces = FaceMean::kHarmonic,
-                       const std::vector<at::Tensor>& robin = {}, bool per_axis = false);
+                       const std::vector<Sides>& sides = {Side::kZero}, const std::vector<double>& lengths = {1.0},
+                       FaceMean faces = FaceMean::kHarmonic, const std::vector<at::Tensor>& robin = {},
+                       bool per_axis = false);
 /// The same with a number as shift.
-inline OperatorSpec diffusion(const at::Tensor& kappa, double shift,
-                              const std::vector<std::array<Side, 2>>& sides = {{Side::kZero, Side::kZero}},
+inline OperatorSpec diffusion(const at::Tensor& kappa, double shift = 0.0,
+                              const std::vector<Sides>& sides = {Side::kZero},
                               const std::vector<double>& lengths = {1.0}, FaceMean faces = FaceMean::kHarmonic,
                               const std::vector<at::Tensor>& robin = {}, bool per_axis = false) {
-  return diffusion(kappa, at::full({}, shift, kappa.options().requires_grad(false)), sides, lengths, faces, robin,
-                   per_axis);
+  const auto options = kappa.defined() ? kappa.options().requires_grad(false) : at::TensorOptions();
+  return diffusion(kappa, at::full({}, shift, options), sides, lengths, faces, robin, per_axis);
 }
 
 /// The operator of kind "diffusion", or "diffusion_per_axis". Parameters: the two sides of each axis, the lengths, the

@@ -73,9 +73,7 @@ void check_nothing_is_captured(const at::Tensor& result, bool reverse) {
                     "detach it");
 }
 
-void refuse_captured_gradients(const OperatorSpec& a) {
-  RegisteredProducts::find(a.shape.at(0))->looks_for_captures = true;
-}
+void refuse_captured_gradients(const OperatorSpec& a) { products_of(a)->looks_for_captures = true; }
 
 void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b) {
   if (a.transposed) return;  // of an adjoint solve, whose A was looked at
@@ -98,7 +96,7 @@ void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b) {
 }
 
 void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
-  const auto code = RegisteredProducts::find(a.shape.at(0))->code;
+  const auto code = products_of(a)->code;
   const bool can_look = b.is_cpu() && b.numel() > 0 && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
   if (!can_look) return;
   const auto solves = static_cast<uint64_t>(code->solves) + 1;

@@ -4,6 +4,8 @@
 #include <typeindex>
 #include <unordered_map>
 
+#include "prdp/error_text.h"
+
 namespace prdp {
 
 namespace {
@@ -50,10 +52,9 @@ std::shared_ptr<const RegisteredProducts> RegisteredProducts::find(int64_t numbe
     const auto entry = registry().entries.find(number);
     if (entry != registry().entries.end()) found = entry->second.lock();
   }
-  TORCH_CHECK_VALUE(
-      found,
-      "Function: the operator no longer exists; keep it, and make it outside of what torch.func.linearize or "
-      "torch.compile runs");
+  TORCH_CHECK_VALUE(found, "Function: the operator no longer exists; keep ",
+                    in_language("it, and make it outside of what torch.func.linearize or torch.compile runs",
+                                "its RegisteredProducts"));
   return found;
 }
 
@@ -63,7 +64,9 @@ RegisteredProducts::~RegisteredProducts() {
 }
 
 std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a) {
-  return is_function(a) ? RegisteredProducts::find(a.shape.at(0)) : nullptr;
+  if (!is_function(a)) return nullptr;
+  TORCH_CHECK_VALUE(!a.shape.empty(), "Function: its operator must come from spec() of RegisteredProducts");
+  return RegisteredProducts::find(a.shape[0]);
 }
 
 }  // namespace prdp

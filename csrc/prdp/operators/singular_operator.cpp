@@ -38,6 +38,7 @@ at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
 }  // namespace
 
 OperatorSpec with_null_space(OperatorSpec a, const at::Tensor& right, std::optional<at::Tensor> left) {
+  TORCH_CHECK_VALUE(!is_singular(a), "with_null_space: the operator has a null space already");
   const auto basis = [&](const at::Tensor& t) {
     return t.defined() ? t : at::empty({0}, a.tensors.empty() ? at::TensorOptions() : a.tensors.back().options());
   };

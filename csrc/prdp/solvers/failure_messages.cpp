@@ -26,7 +26,9 @@ std::string name_of(const Solver& solver) {
   if (method.counts == Counts::kCycles) text << "(" << solver.restart << ")";
   if (solver.method == Method::kMultigrid) return text.str();  // its cycles are its preconditioner
   if (solver.preconditioner.is_operator()) text << " with preconditioner " << solver.preconditioner.title();
-  else if (solver.preconditioner) text << " with preconditioner=\"" << solver.preconditioner.title() << "\"";
+  else if (solver.preconditioner)
+    text << in_language(" with preconditioner=\"", " with Preconditioner::") << solver.preconditioner.title()
+         << in_language("\"", "()");
   return text.str();
 }
 
@@ -146,7 +148,9 @@ std::string breakdown(const SolveRole& role, const Operator& a, const at::Tensor
                "or A is not") +
            in_language("; prdp.check_operator(A, b, solver) looks at both", "");
   if (traits(solver.method).made_for == MadeFor::kDefinite)
-    return "r·A r is zero for a residual r: " + not_definite(role, a, b, sample);
+    return (solver.preconditioner ? "p·A p for a direction p is zero or changes its sign: "
+                                  : "r·A r is zero for a residual r: ") +
+           not_definite(role, a, b, sample);
   if (traits(solver.method).made_for == MadeFor::kSymmetric) return not_minimal(role, a, b, sample);
   if (maps_ones_to_zero(solver.preconditioner, b, sample))
     return "its preconditioner maps a vector of ones to zero; look at what M⁻¹ is made of";

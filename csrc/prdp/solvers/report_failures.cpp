@@ -96,7 +96,8 @@ void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
   warn_once("cotangents", 0.0, [&](std::ostream& text) {
     text << name_of(role) << ": the cotangent of " << lost << " of " << status.size(0)
          << " samples contains NaN or Inf, and their gradient is zero. A GradScaler cannot see that: take bfloat16 "
-            "without one, or a small scale that stays, such as GradScaler(init_scale=256.0, growth_interval=10**9)";
+            "without one, or a small scale that stays"
+         << in_language(", such as GradScaler(init_scale=256.0, growth_interval=10**9)", "");
   });
 }
 
@@ -245,8 +246,8 @@ void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_sol
        << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
        << " and ⟨u, ū⟩ = " << of_adjoint << " should be equal. Is "
        << in_language("`transpose` right, or A symmetric where symmetric=True", "`apply_transpose` right")
-       << "? Do the functions still see the tensors that they captured?"
-       << in_language(" prdp.check_operator tells", "");
+       << ", and do the functions still see the tensors that they captured? "
+       << in_language("prdp.check_operator tells", "To check: ⟨v, A u⟩ = ⟨Aᵀ v, u⟩ for random u and v");
   warn_this_once(text.str(), /*may_get_worse=*/false);
 }
 

@@ -58,6 +58,8 @@ namespace {
 
 void check_budget(const char* who, const char* prefix, const c10::SymInt& max_iter, double rtol) {
   // A symbolic max_iter is checked when its number is known, as the graph runs.
+  TORCH_CHECK_VALUE(max_iter.is_symbolic() || max_iter.expect_int() != kToBeGiven || *prefix, who,
+                    ": max_iter must be given, as a number >= 0");
   TORCH_CHECK_VALUE(max_iter.is_symbolic() || max_iter.expect_int() >= 0, who, ": ", prefix,
                     "max_iter must be >= 0, got ", max_iter);
   TORCH_CHECK_VALUE(rtol >= 0.0, who, ": ", prefix, "rtol must be >= 0, got ", rtol);
@@ -89,8 +91,8 @@ void Solver::check(const char* who) const {
 void SolveOptions::check(const char* who) const {
   solver.check(who);
   check_budget(who, "adjoint_", adjoint_max_iter.value_or(0), adjoint_rtol.value_or(0.0));
-  TORCH_CHECK_VALUE(checkpoint_every >= kCheckpointSqrt, who, ": checkpoint_every must be >= 1, got ",
-                    checkpoint_every);
+  TORCH_CHECK_VALUE(checkpoint_every >= kCheckpointSqrt, who,
+                    ": checkpoint_every must be >= 1, 0 for none or kCheckpointSqrt, got ", checkpoint_every);
   TORCH_CHECK_VALUE(checkpoint_every == 0 || backward == Backward::kUnrolled, who,
                     ": checkpoint_every is for backward = unrolled alone, got ", name(backward));
 }

@@ -12,8 +12,10 @@ namespace prdp {
 
 namespace {
 
+void warn_by_torch(const std::string& text) { TORCH_WARN(text); }
+
 std::atomic<WarningSink>& warning_sink() {
-  static std::atomic<WarningSink> sink{[](const std::string& text) { TORCH_WARN(text); }};
+  static std::atomic<WarningSink> sink{warn_by_torch};
   return sink;
 }
 
@@ -26,7 +28,7 @@ std::string step_prefix() {
 
 }  // namespace
 
-void set_warning_sink(WarningSink sink) { warning_sink() = sink; }
+void set_warning_sink(WarningSink sink) { warning_sink() = sink ? sink : warn_by_torch; }
 
 FailuresOfStep::FailuresOfStep(int64_t step, int64_t steps)
     : step_before_(std::exchange(step_now, step)), steps_before_(std::exchange(steps_in_all, steps)) {}

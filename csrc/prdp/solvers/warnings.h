@@ -8,7 +8,7 @@
 /// How failures and warnings of solves are said: in a rollout with the step, and warnings not twice.
 namespace prdp {
 
-/// Sets where warnings go. By default torch prints them on stderr.
+/// Sets where warnings go; null: back to torch, which prints them on stderr.
 using WarningSink = void (*)(const std::string& text);
 void set_warning_sink(WarningSink sink);
 

@@ -36,6 +36,7 @@ SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const 
 SolveResult ImplicitStep::solve_from(const at::Tensor& u, int64_t adjoint_log) const {
   const auto a = operator_(u);
   const auto b = rhs(u);
+  TORCH_CHECK_VALUE(b.defined(), who_, ": rhs returned an undefined tensor");
   TORCH_CHECK_VALUE(b.sizes() == u.sizes() && b.scalar_type() == u.scalar_type(), who_,
                     ": rhs must return the shape and dtype of the state, ", u.sizes(), " in ", u.scalar_type(),
                     ", got ", b.sizes(), " in ", b.scalar_type());
@@ -45,14 +46,14 @@ SolveResult ImplicitStep::solve_from(const at::Tensor& u, int64_t adjoint_log) c
 }
 
 at::Tensor ImplicitStep::operator()(const at::Tensor& u) {
-  auto next = reported([&] { return solve(u, *log_); });
+  auto next = reported(u, [&] { return solve(u, *log_); });
   if (next.requires_grad()) logs_of_steps_.clear();
   return next;
 }
 
 at::Tensor ImplicitStep::rollout(const at::Tensor& u, int64_t steps) {
   std::vector<AdjointLog> logs;
-  auto states = reported([&] {
+  auto states = reported(u, [&] {
     TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
     return solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) {
       logs.push_back(open_adjoint_log());

@@ -33,6 +33,12 @@ StepperBase::StepperBase(std::string who, SolveOptions options)
   options_.check(who_.c_str());
 }
 
+void StepperBase::check_state(const at::Tensor& u) const {
+  TORCH_CHECK_VALUE(log_, "a stepper that was moved from makes no steps");
+  TORCH_CHECK_VALUE(u.defined(), who_, ": u is an undefined tensor");
+  TORCH_CHECK_VALUE(u.layout() == at::kStrided, who_, ": u must be a dense tensor, got the layout ", u.layout());
+}
+
 void StepperBase::set_max_iter(int64_t k) {
   auto solver = options_.solver;
   solver.max_iter = k;

@@ -39,13 +39,16 @@ class StepperBase {
  protected:
   /// Raises ValueError, in the name of `who`, for options out of range.
   StepperBase(std::string who, SolveOptions options);
-  /// What a step or a rollout returns, solve(). Its report is kept; one that raises has none.
+  /// Raises ValueError unless a state is a dense tensor, and the stepper not moved from.
+  void check_state(const at::Tensor& u) const;
+  /// What a step or a rollout from u returns, solve(). Its report is kept; one that raises has none.
   template <class Solve>
-  at::Tensor reported(const Solve& solve) {
+  at::Tensor reported(const at::Tensor& u, const Solve& solve) {
     info_.reset();
-    auto [u, info] = solve();
+    check_state(u);
+    auto [next, info] = solve();
     info_ = std::move(info);
-    return u;
+    return next;
   }
 
   std::string who_;

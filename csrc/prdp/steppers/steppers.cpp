@@ -24,11 +24,11 @@ Stepper::Stepper(Equation equation, SolveOptions options)
 }
 
 at::Tensor Stepper::operator()(const at::Tensor& u) {
-  return reported([&] { return step(equation_, u, options_); });
+  return reported(u, [&] { return step(equation_, u, options_); });
 }
 
 at::Tensor Stepper::rollout(const at::Tensor& u, int64_t steps) {
-  return reported([&] { return prdp::rollout(equation_, u, steps, options_); });
+  return reported(u, [&] { return prdp::rollout(equation_, u, steps, options_); });
 }
 
 Poisson::Poisson(std::vector<int64_t> shape, Solver solver, Backward backward, Length length)

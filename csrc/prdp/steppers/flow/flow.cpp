@@ -1,5 +1,6 @@
 #include "prdp/steppers/flow/flow.h"
 
+#include "prdp/error_text.h"
 #include "prdp/steppers/flow/projection.h"
 #include "prdp/steppers/flow/rollout.h"
 #include "prdp/steppers/flow/tendency.h"
@@ -18,6 +19,11 @@ FlowEquation make_equation(std::vector<int64_t> shape, Viscosity nu, double dt, 
   }
   return {std::move(box),   dt,          std::move(nu.tensor), s.force,   s.inflow,
           std::move(walls), s.advection, s.diffusion,          s.pressure};
+}
+
+void check_start(const SolveOptions& options) {
+  TORCH_CHECK_VALUE(options.start == Start::kZero, "Flow: start must be ", in_language("'zero'", "Start::kZero"),
+                    ": its solves are for changes");
 }
 
 SolveOptions without_log(SolveOptions options) {
@@ -47,7 +53,7 @@ at::Tensor flow_divergence_of_state(const FlowEquation& equation, const at::Tens
 Flow::Flow(FlowEquation equation, SolveOptions options)
     : StepperBase("Flow", std::move(options)), equation_(std::move(equation)) {
   options_.adjoint_log = *log_;
-  TORCH_CHECK_VALUE(options_.start == Start::kZero, "Flow: start must be 'zero': its solves are for changes");
+  check_start(options_);
   equation_.check();
 }
 
@@ -55,17 +61,26 @@ Flow::Flow(std::vector<int64_t> shape, Viscosity nu, double dt, FlowSettings set
     : Flow(make_equation(std::move(shape), std::move(nu), dt, std::move(settings)), {std::move(solver), backward}) {}
 
 at::Tensor Flow::operator()(const at::Tensor& u) {
-  return reported([&] { return flow_next(equation_, u, options_); });
+  return reported(u, [&] {
+    check_start(options_);
+    return flow_next(equation_, u, options_);
+  });
 }
 
 std::pair<at::Tensor, at::Tensor> Flow::step_and_pressure(const at::Tensor& u) {
-  const auto both = reported([&] { return flow_next_and_pressure(equation_, u, options_); });
+  const auto both = reported(u, [&] {
+    check_start(options_);
+    return flow_next_and_pressure(equation_, u, options_);
+  });
   const int64_t d = equation_.box->dim();
   return {both.narrow(1, 0, d), both.narrow(1, d, 1)};
 }
 
 at::Tensor Flow::rollout(const at::Tensor& u, int64_t steps) {
-  return reported([&] { return flow_rollout(equation_, u, steps, options_); });
+  return reported(u, [&] {
+    check_start(options_);
+    return flow_rollout(equation_, u, steps, options_);
+  });
 }
 
 at::Tensor Flow::project(const at::Tensor& u) const { return flow_project(equation_, u, options_); }
