@@ -133,7 +133,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   PRDP_NOINLINE Scalar residual(const T* x, Vector r) {
     const T* const of = started_ ? original_b() : b();
     T s = 0;
-    product<1>(solution(x), [&](int i, T value) {
+    product<false>(solution(x), [&](int i, T value) {
       const T left = of[i] - value;
       r[i] = left;
       s += left * left;
@@ -152,7 +152,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     Vector signed_u = scratch();
     this->template each<1>([&](int i) { return is_negated_in(attempt, i) ? -u[i] : u[i]; }, into(signed_u));
     T s = 0;
-    product<1>(signed_u, [&](int, T value) { s += value * value; });
+    product<false>(signed_u, [&](int, T value) { s += value * value; });
     --state_->applications;  // no part of the method
     return team_.sum(s);
   }
@@ -230,19 +230,20 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   struct Pair {
     T first, second;
   };
-  /// A row of the Navier-Stokes equations has loads enough.
-  static constexpr int kRowsAtOnce = requires { A::kVelocity; } ? 1 : kCellsAtOnce;
+  /// A row of the Navier-Stokes equations is long, and its text is there once.
+  static constexpr bool kIsLong = requires { A::kVelocity; };
+  static constexpr int kRowsAtOnce = requires { A::kLoadsEnough; } ? 1 : kCellsAtOnce;
   /// store(i, (A v)_i) for this thread's cells. Slower threads still read v: between a product and the next write to v
   /// there must be a barrier, which a sum or another product has. Every method has one; a test leaves them out in turn.
-  template <int kAtOnce = kRowsAtOnce, class Store>
+  template <bool kOften = true, class Store>
   void product(const T* v, const Store& store) {
     ++state_->applications;
     team_.meet();
-    if constexpr (kAtOnce == 1) {
-      this->template each<1>([&](int i) { return entry_of_product(v, i); }, store);
-    } else {
+    if constexpr (kOften && !kIsLong) {
       const A a = a_;  // in registers; a member's members would be loaded again for each cell
-      this->template each<kAtOnce>([&](int i) { return a.product(v, i); }, store);
+      this->template each<kRowsAtOnce>([&](int i) { return a.product(v, i); }, store);
+    } else {
+      this->template each<1>([&](int i) { return entry_of_product(v, i); }, store);
     }
   }
   PRDP_NOINLINE T entry_of_product(const T* v, int i) const { return a_.product(v, i); }

@@ -34,6 +34,8 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
   /// Whether the shift and the Robin sides alone hold u, and A is singular where they are zero.
   static constexpr bool kMayBeUnheld = ((kSides != kZeroSide) && ...);
 
+  static constexpr bool kLoadsEnough = true;  // in a row: those of other rows need not be under way with them
+
   using Cycled = Diffusion;
   using Points = G;
   static constexpr bool periodic(int axis) {
@@ -77,7 +79,10 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
   T product(const V& v, int i) const {
     T flux = 0;
     const T centre = v[i];
-    const T row_sum = for_each_face(i, [&](T c, int j, int, int) { flux += c * (centre - v[j]); });
+    const int channel = i - i % G::kPoints;
+    const Around values(G(i % G::kPoints), [&](int, int there) { return v[channel + there]; });
+    const auto add = [&](T c, int, int axis, int cells) { flux += c * (centre - values.of[2 * axis + (cells > 0)]); };
+    const T row_sum = for_each_face(i, add);
     return this->factor() * (row_sum * centre + flux);
   }
 
@@ -94,30 +99,56 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
     T row_sum = shift_ ? shift_[point] : shift_number_;
     for (int k = 0; k < kKappas; ++k)
       row_sum += T(0) * kappa_[int64_t{k} * G::kPoints + point];  // NaN where κ is not finite
-    row_sum += face<0, 0>(at, i, f, beyond) + face<0, 1>(at, i, f, beyond);
-    row_sum += face<1, 0>(at, i, f, beyond) + face<1, 1>(at, i, f, beyond);
-    row_sum += face<2, 0>(at, i, f, beyond) + face<2, 1>(at, i, f, beyond);
+    const Around kappa(at, [&](int axis, int there) { return kappa_of(axis)[there]; });
+    row_sum += face<0, 0>(at, i, kappa, f, beyond) + face<0, 1>(at, i, kappa, f, beyond);
+    row_sum += face<1, 0>(at, i, kappa, f, beyond) + face<1, 1>(at, i, kappa, f, beyond);
+    row_sum += face<2, 0>(at, i, kappa, f, beyond) + face<2, 1>(at, i, kappa, f, beyond);
     return row_sum;
   }
+  /// The κ of an axis. Those of one cell need none.
+  const T* kappa_of(int axis) const {
+    const int own = axis + kKappas - 3;
+    return kappa_ + (kKappas == 1 || own < 0 ? int64_t{0} : int64_t{own}) * G::kPoints;
+  }
+  /// The neighbour beyond a face, or -1.
+  template <int axis, int end>
+  static int neighbour(const G& at) {
+    constexpr int sides[] = {kSides...}, extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
+    constexpr bool wraps = sides[2 * axis + end] == kPeriodicSide && n > 1;
+    const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x;
+    const int next = moved<n, end == 0 ? -1 : 1, wraps>(here);
+    constexpr int stride = axis == 0 ? G::kY * G::kX : axis == 1 ? G::kX : 1;
+    return next < 0 ? -1 : at.point() + (next - here) * stride;
+  }
+  /// get(axis, there) for the neighbour beyond each face, or for the cell itself: loads without a branch, so that none
+  /// waits for another.
+  struct Around {
+    template <class Get>
+    Around(const G& at, const Get& get) {
+      set<0>(at, get);
+      set<1>(at, get);
+      set<2>(at, get);
+    }
+    template <int axis, class Get>
+    void set(const G& at, const Get& get) {
+      const int below = neighbour<axis, 0>(at), above = neighbour<axis, 1>(at);
+      of[2 * axis] = get(axis, below < 0 ? at.point() : below);
+      of[2 * axis + 1] = get(axis, above < 0 ? at.point() : above);
+    }
+    T of[6];
+  };
   template <int axis, int end, class F, class Beyond>
-  T face(const G& at, int i, const F& f, const Beyond& beyond) const {
+  T face(const G& at, int i, const Around& around, const F& f, const Beyond& beyond) const {
     constexpr int sides[] = {kSides...};
-    constexpr int side = sides[2 * axis + end], extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
-    const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x, point = at.point();
-    const T scale = inverse_width_[axis] * inverse_width_[axis];
-    constexpr int own = axis + kKappas - 3;  // below 0 on axes of one cell, which need none
-    const T* const kappa = kappa_ + (kKappas == 1 || own < 0 ? int64_t{0} : int64_t{own}) * G::kPoints;
-    constexpr int cells = end == 0 ? -1 : 1;
-    constexpr bool wraps = side == kPeriodicSide && n > 1;
-    const int next = moved<n, cells, wraps>(here);
-    if (next >= 0) {
-      constexpr int stride = axis == 0 ? G::kY * G::kX : axis == 1 ? G::kX : 1;
-      const int there = point + (next - here) * stride;
-      f(scale * mean(kappa[point], kappa[there]), i - point + there, axis, cells);
+    constexpr int side = sides[2 * axis + end], cells = end == 0 ? -1 : 1;
+    const int point = at.point(), there = neighbour<axis, end>(at);
+    const T scale = inverse_width_[axis] * inverse_width_[axis], kappa = kappa_of(axis)[point];
+    if (there >= 0) {
+      f(scale * mean(kappa, around.of[2 * axis + end]), i - point + there, axis, cells);
       return 0;
     }
     if constexpr (side != kZeroSide && side != kRobinSide) return 0;
-    const T conductance = side_conductance<axis, end>(at, 2 * scale * kappa[point]);
+    const T conductance = side_conductance<axis, end>(at, 2 * scale * kappa);
     beyond(conductance, axis, cells);
     return conductance;
   }

@@ -33,8 +33,10 @@ class Team {
     PRDP_NO_UNROLL for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end;
                         first += kThreads * kAtOnce) {
       decltype(f(0)) value[kAtOnce];
-      PRDP_UNROLL for (int k = 0; k < kAtOnce; ++k) if (first + k * kThreads < mine.end) value[k] =
-          f(first + k * kThreads);
+      PRDP_UNROLL for (int k = 0; k < kAtOnce; ++k) {
+        const int i = first + k * kThreads;
+        value[k] = f(i < mine.end ? i : first);  // without a branch, at which loads would wait
+      }
       PRDP_UNROLL for (int k = 0; k < kAtOnce; ++k) if (first + k * kThreads < mine.end)
           store(first + k * kThreads, value[k]);
     }
