@@ -82,6 +82,30 @@ def _legend(points):
     return handles
 
 
+def devices(records):
+    """For each problem, the error over the time of a solve with its gradient, as K grows. The error is that of the
+    gradient where it is known, else the residual."""
+    titles = list(dict.fromkeys(r["problem"] for r in records))
+    figure = Figure(figsize=(3.7 * min(len(titles), 4), 3.4 * -(-len(titles) // 4)), layout="constrained")
+    panels = figure.subplots(-(-len(titles) // 4), min(len(titles), 4), squeeze=False).flat
+    for axes, title in zip(panels, titles, strict=False):
+        of_problem = [r for r in records if r["problem"] == title]
+        for way in dict.fromkeys(r["way"] for r in of_problem):
+            line = sorted((r for r in of_problem if r["way"] == way), key=lambda r: r["k"])
+            error = [max(r.get("gradient_error", r["residual"]), 1e-16) for r in line]
+            style = {"marker": "s"} if "eager" in way else {"marker": "^"} if "JAX" in way else {"marker": "o"}
+            axes.plot([1e3 * r["seconds"] for r in line], error, lw=1.4, ms=5, label=way, **style)
+        known = "gradient_error" in of_problem[0]
+        axes.set(xscale="log", yscale="log", title=title, xlabel="solve and gradient, ms for the batch")
+        axes.set(ylabel="error of the gradient" if known else "residual")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.grid(alpha=0.3, lw=0.4)
+        axes.legend(frameon=False, fontsize=8)
+    for axes in list(panels):
+        axes.set_visible(False)
+    return figure
+
+
 def size(series):
     """Time per unknown and iteration over the size of a sample, and over the batch."""
     figure = Figure(figsize=(11, 4.6), layout="constrained")

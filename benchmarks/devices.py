@@ -11,14 +11,17 @@ import json
 import os
 import statistics
 import time
+from pathlib import Path
 
 import torch
 
 import prdp_torch as prdp
-from benchmarks import problems
+from benchmarks import charts, problems
 from benchmarks.peers import stencils, torch_eager
 from prdp_torch import operators
+from prdp_torch.experiments.charts import write_png
 
+CURVES = " raise", "eager torch loop", "JAX jit"  # the ways that are timed for several K
 LARGEST_FACTORED = 100_000  # unknowns of a sample, up to which the gradient is compared with that of a direct solve
 
 
@@ -39,10 +42,10 @@ def problem_offsets(problem):
     return problems._C.diffusion_stencil(problem.kappa, problem.dt)[1]
 
 
-def calls(problem, device):
-    """{name: a solve with its gradient}, the solver of the suite with the K of the suite."""
+def calls(problem, device, k):
+    """{name: a solve with its gradient}, the solver of the suite with K = k."""
     a, product = on(device, problem)
-    b, g, k = problem.b.to(device), problem.g.to(device), problem.k
+    b, g = problem.b.to(device), problem.g.to(device)
     solver = problem.solver(k)
 
     def ours(a, solver, **options):
@@ -132,6 +135,10 @@ def suite(quick):
     return [*some, problems.DIFFUSION["diffusion_64"](), problems.DIFFUSION["diffusion_256"](), large]
 
 
+def other_budgets(k, quick):
+    return (2 * k,) if quick else (max(1, k // 4), max(1, k // 2), 2 * k)
+
+
 def flows(quick):
     """Rollouts of a `Flow` with their gradient: shape, batch, steps."""
     return [((8, 8), 2, 2)] if quick else [((64, 64), 16, 20), ((256, 256), 1, 10)]
@@ -172,9 +179,12 @@ def run(device, quick=False):
     """Yields a record for each problem and way."""
     rounds = 1 if quick else 9
     for problem in suite(quick):
-        for way, call in calls(problem, device).items():
-            shown = {"problem": problem.title, "k": 1 if way == "one iteration" else problem.k, "way": way}
-            yield {**shown, **errors(problem, *call()), **seconds(call, device, rounds)}
+        for k in (problem.k, *other_budgets(problem.k, quick)):
+            for way, call in calls(problem, device, k).items():
+                if k != problem.k and not way.endswith(CURVES):
+                    continue
+                shown = {"problem": problem.title, "k": 1 if way == "one iteration" else k, "way": way}
+                yield {**shown, **errors(problem, *call()), **seconds(call, device, rounds)}
     for shape, batch, steps in flows(quick):
         ways, project, exact = flow_calls(shape, batch, steps, device)
         for way, call in ways.items():
@@ -191,11 +201,20 @@ def main():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.devices")
     parser.add_argument("--device", type=torch.device, default=torch.device("cuda"))
     parser.add_argument("--quick", action="store_true", help="small problems, to see that all of it runs")
+    parser.add_argument("--chart", type=Path, help="where to draw the errors over the time")
     options = parser.parse_args()
     of = torch.cuda.get_device_name(options.device) if options.device.type == "cuda" else "the CPU's plain loops"
     print(json.dumps({"device": str(options.device), "name": of, "torch": torch.__version__}), flush=True)
+    records = []
     for record in run(options.device, options.quick):
         print(json.dumps(record), flush=True)
+        records.append(record)
+    if options.chart:
+        write_png(
+            charts.devices([r for r in records if r.get("way", "").endswith(CURVES) and "k" in r]),
+            options.chart,
+            dpi=110,
+        )
 
 
 if __name__ == "__main__":

@@ -254,7 +254,7 @@ def _bench_device(project: Path, device: str, suites: Sequence[str], out: Path |
         raise ValueError(f"bench: the suites time the CPU; with --device give none, got {', '.join(suites)}")
     environment = records.environment(_C.find_device(device))
     path = records.prepare_folder(out or Path("runs") / "bench").resolve() / "devices.json"
-    arguments = ["--device", device, *(["--quick"] if quick else [])]
+    arguments = ["--device", device, "--chart", str(path.with_suffix(".png")), *(["--quick"] if quick else [])]
     found = []
     run = [sys.executable, "-m", "benchmarks.devices", *arguments]
     with subprocess.Popen(run, cwd=project, stdout=subprocess.PIPE, text=True) as running:

@@ -272,6 +272,7 @@ def test_bench_times_a_device(tmp_path):
     assert first["device"] == record["machine"]["device"] == "cpu" and first["torch"] == torch.__version__
     solves = [row for row in rows if "residual" in row]
     flows = [row for row in rows if row["problem"].startswith("Flow")]
+    assert (tmp_path / "devices.png").stat().st_size > 10_000
     assert len(solves) > 10 and len(flows) >= 2 and len(solves) + len(flows) == len(rows)
     assert all(row["seconds"] > 0 for row in rows) and all(row["residual"] < 1 for row in solves)
     assert all(row["error"] < 1e-3 and row["gradient_error"] < 1e-3 for row in flows)
