@@ -38,10 +38,10 @@ class _There(torch.Tensor):
     """A tensor on the stand-in."""
 
     @staticmethod
-    def __new__(cls, numbers):
+    def __new__(cls, numbers, device=DEVICE):
         made = torch.Tensor._make_wrapper_subclass(
             cls, numbers.shape, strides=numbers.stride(), storage_offset=numbers.storage_offset(), dtype=numbers.dtype,
-            device=DEVICE,
+            device=device,
         )  # fmt: skip
         made.numbers = numbers
         return made
@@ -61,8 +61,8 @@ class StandIn(TorchDispatchMode):
         self.largest = 0  # numbers in the memory of a result
 
     @staticmethod
-    def send(tensor):
-        return _There(tensor.detach().clone())
+    def send(tensor, device=DEVICE):
+        return _There(tensor.detach().clone(), device)
 
     @staticmethod
     def fetch(tensor):
@@ -78,11 +78,12 @@ class StandIn(TorchDispatchMode):
             with self:
                 return function.redispatch(KEY, *args, **kwargs)
         name = function._schema.name.removeprefix("aten::")
-        given, asked_for = [], []
+        given, devices, asked_for = [], [], []
 
         def numbers(value):
             if isinstance(value, _There):
                 given.append(value)
+                devices.append(value.device)
                 return value.numbers
             if isinstance(value, torch.device):
                 asked_for.append(value)
@@ -110,6 +111,6 @@ class StandIn(TorchDispatchMode):
                 return value
             self.largest = max(self.largest, value.untyped_storage().nbytes() // value.element_size())
             written = [t for t in given if t.numbers is value]
-            return written[0] if written else _There(value)
+            return written[0] if written else _There(value, *devices[:1])
 
         return each(back, function(*here, **named))

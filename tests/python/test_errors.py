@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers import field
+from stand_in_device import StandIn
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -77,6 +78,16 @@ def test_a_tensor_on_another_device_is_named_with_both(name):
     b = torch.zeros(1, channels, 5, 6)
     for graph in (torch.no_grad, torch.enable_grad):
         with graph(), pytest.raises(ValueError, match=f"{message} meta but the vector is on cpu"):
+            prdp.linear_solve(a, b, prdp.GMRES(1))
+
+
+@pytest.mark.parametrize("name", ["stencil", "kappa", "burgers", "navier-stokes"])
+def test_so_is_one_on_another_device_of_the_same_kind(name):
+    make, channels, message = ELSEWHERE[name]
+    with StandIn() as first:
+        a = make(lambda *shape: first.send(torch.ones(*shape), torch.device("lazy", 1)))
+        b = first.send(torch.zeros(1, channels, 5, 6))
+        with pytest.raises(ValueError, match=f"{message} lazy:1 but the vector is on lazy:0"):
             prdp.linear_solve(a, b, prdp.GMRES(1))
 
 
