@@ -66,6 +66,12 @@ def lengths(who: str, value: object, axes: int) -> list[float]:
     return [] if all(side == 1.0 for side in sides) else sides
 
 
+def writes(t: Tensor) -> int | None:
+    """How often a tensor was written to; None where nobody counts. A view has the count of its base, which may be
+    written to elsewhere: in another state of a history, say."""
+    return None if torch.compiler.is_compiling() or t.is_inference() or t._is_view() else t._version
+
+
 def dense(who: str, name: str, value: object) -> Tensor:
     if not isinstance(value, Tensor):
         raise TypeError(f"{who}: {name} must be a torch tensor, got {type(value).__name__}")

@@ -69,7 +69,10 @@ def rollout(stepper: Callable[[Tensor], Tensor], u: Tensor, steps: int) -> Tenso
         raise ValueError(f"rollout: steps must be >= 0, got {steps}")
     states = [_check.dense("rollout", "u", u)]
     for _ in range(steps):
+        writes = _check.writes(states[-1])
         states.append(stepper(states[-1]))
+        if _check.writes(states[-2]) != writes:
+            raise ValueError("rollout: the step changes its state in place; it must leave it as it is")
         if states[-1].shape != u.shape:
             raise ValueError(
                 f"rollout: the step must keep the shape of its input, {tuple(u.shape)}, got {tuple(states[-1].shape)}"

@@ -197,11 +197,10 @@ class Stepper(HasSettings):
 
     def _solve_from(self, u: Tensor, log: AdjointLog) -> Solution:
         who, compiling = type(self).__name__, torch.compiler.is_compiling()
-        # A view has the version of its base, which rhs may write to: another state of a history, say.
-        writes = None if compiling or u.is_inference() or u._is_view() else u._version
+        writes = _check.writes(u)
         a = as_operator(who, "operator(u)", self.operator(u))
         b = self._rhs_with(u, a)
-        if writes is not None and u._version != writes:
+        if _check.writes(u) != writes:
             raise ValueError(
                 f"{who}: operator or rhs changes the state u in place; it must return a new tensor and leave u as it is"
             )

@@ -147,6 +147,7 @@ def check_network(scene: _C.Scene, network: object, states: Tensor) -> None:
                 else f"call network.to({scene.dtype})"
             )
         )
+    before = states.clone()
     try:
         with evaluating(network), torch.random.fork_rng(devices=[]):
             answer = network(states)
@@ -155,6 +156,14 @@ def check_network(scene: _C.Scene, network: object, states: Tensor) -> None:
     if not isinstance(answer, torch.Tensor) or answer.shape != states.shape:
         got = tuple(answer.shape) if isinstance(answer, torch.Tensor) else type(answer).__name__
         raise ValueError(f"train: network must keep the shape of its input, {tuple(states.shape)}, got {got}")
+    if answer.dtype != states.dtype:
+        raise ValueError(f"train: network must keep the dtype of its input, {states.dtype}, got {answer.dtype}")
+    if not states.equal(before):
+        states.copy_(before)
+        raise ValueError(
+            "train: network changes its input in place, as a first layer with inplace=True does; it must leave it as "
+            "it is"
+        )
 
 
 def _split(scene: _C.Scene, trajectories: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,9 +20,14 @@ def make(scene: _C.Scene, seed: int) -> torch.nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            return _in_dtype(cls(), scene.dtype)
+            network = _in_dtype(cls(), scene.dtype)
         except Exception as error:
             raise _refused(scene, f"{cls.__name__}() raised {type(error).__name__}: {error}") from error
+    if any(torch.nn.parameter.is_lazy(t) for t in (*network.parameters(), *network.buffers())):
+        raise _refused(
+            scene, f"{cls.__name__}() has lazy layers, whose sizes are not known when weights are read; give them"
+        )
+    return network
 
 
 def fingerprint(scene: _C.Scene) -> str:

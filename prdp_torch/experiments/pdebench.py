@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from prdp_torch.advice_text import dtype_name
 from prdp_torch.experiments import _C, array_files
 
 _AXES = ("x", "y", "z")
@@ -65,7 +66,7 @@ def check_finite(who: str, trajectories: Tensor) -> None:
     """ValueError for a trajectory with NaN or Inf."""
     bad = (~trajectories.isfinite().flatten(1).all(1)).nonzero().flatten()
     if len(bad):
-        raise ValueError(f"{who}: trajectory {int(bad[0])} holds NaN or Inf")
+        raise ValueError(f"{who}: trajectory {int(bad[0])} holds NaN or Inf, in {dtype_name(trajectories.dtype)}")
 
 
 def _grid(scene: _C.Scene, axis: int) -> tuple[float, float]:

@@ -116,7 +116,7 @@ def test_scenes_are_listed(tmp_path):
         (["train", "heat_1d", "--prdp", "--direct"], "give one of --auto, --prdp, --constant, --schedule and --direct"),
         (
             ["train", "heat_1d", "--backward", "both"],
-            "backward: unknown name 'both' for a scene; allowed: implicit, unrolled",
+            "backward: expected implicit or unrolled for this scene, got 'both'",
         ),
         (["train", "heat_1d", "--out", "/proc/nothing"], "prdp: --out: cannot write to '/proc/nothing'"),
         (["train", "heat_1d", "--constant", "0"], "--constant"),

@@ -228,5 +228,5 @@ def test_compare_leaves_the_exact_solver_out(tmp_path):
 
 
 def test_a_derivative_that_there_is_not_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="unknown name 'x' for a scene; allowed: implicit, unrolled, none"):
+    with pytest.raises(ValueError, match="expected implicit or unrolled or none for this scene, got 'x'"):
         scenes.load("navier_stokes").backward = "x"

@@ -245,3 +245,10 @@ def test_npz_needs_no_h5py(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, "export", "heat_1d", "--out", "x.npz"], cwd=tmp_path,
                           capture_output=True, text=True)  # fmt: skip
     assert done.returncode == 0 and (tmp_path / "x.npz").exists(), done.stderr
+
+
+@pytest.mark.parametrize("scene", ["poisson_1p", "darcy_emulator"])
+def test_a_scene_without_trajectories_exports_none(scene, tmp_path):
+    done = CliRunner().invoke(cli.app, ["export", scene, "--out", str(tmp_path / "x.npz")])
+    assert done.exit_code == 2 and f"export: the scene {scene} has no trajectories" in done.stderr
+    assert not list(tmp_path.iterdir())

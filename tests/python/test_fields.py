@@ -103,3 +103,12 @@ def test_rollout_stacks_the_states_and_differentiates():
 def test_bad_arguments_are_refused_in_words(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+def test_rollout_refuses_a_step_that_changes_its_state():
+    """As the states before it would be other ones than those that were handed out."""
+    network = torch.nn.Sequential(torch.nn.ReLU(inplace=True), torch.nn.Linear(8, 8))
+    with torch.no_grad(), pytest.raises(ValueError, match="rollout: the step changes its state in place"):
+        fields.rollout(network, torch.randn(2, 1, 8), 1)
+    history = torch.zeros(2, 4, 8)
+    assert fields.rollout(lambda u: history[:, 1:2].copy_(u + 1), history[:, :1], 1).shape == (2, 2, 1, 8)

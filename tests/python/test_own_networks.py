@@ -13,6 +13,7 @@ import prdp_torch as prdp
 from prdp_torch.experiments import _C, compare, records, scenes
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 TRAINER = Path(__file__).parents[2] / "build" / "prdp_train"
 SOURCE = """
@@ -37,6 +38,17 @@ class Fourier(torch.nn.Module):
 
     def forward(self, u):
         return torch.fft.irfft(torch.einsum("bci,oci->boi", torch.fft.rfft(u), self.weight), n=u.shape[-1])
+
+
+class Lazy(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.LazyLinear(30)
+
+
+class InPlace(Net):
+    def forward(self, u):
+        return super().forward(u.mul_(0.5))
 
 
 class Wide(torch.nn.Module):
@@ -149,6 +161,7 @@ def test_the_cpp_trainer_says_that_it_cannot(tmp_path, module):
         ("{module}:Broken", "'{folder}/{module}.py' has no subclass of torch.nn.Module, Broken"),
         ("os:abort", "has no subclass of torch.nn.Module, abort"),
         ("{module}:Wide", "Wide() raised TypeError: "),
+        ("{module}:Lazy", "Lazy() has lazy layers, whose sizes are not known when weights are read; give them"),
     ],
 )
 def test_what_is_no_network_is_refused_in_words(tmp_path, module, network, message):
@@ -159,6 +172,22 @@ def test_what_is_no_network_is_refused_in_words(tmp_path, module, network, messa
     text = str(error.value)
     assert text.startswith(f"network: '{network}' of the scene '{scene.path}': ") and "\n" not in text
     assert message.format(folder=tmp_path, module=module) in text
+
+
+def test_a_network_that_changes_its_input_is_refused_before_it_is_trained(tmp_path, module):
+    scene = scenes.load(scene_with(tmp_path, f"{module}:InPlace"))
+    with pytest.raises(ValueError, match="train: network changes its input in place"):
+        trained(scene, tmp_path)
+    with pytest.raises(ValueError, match=r"train: network must keep the dtype of its input, torch\.float32, got"):
+        train(scene, Refinement.auto(), network=Doubled())
+
+
+class Doubled(torch.nn.Linear):
+    def __init__(self):
+        super().__init__(30, 30)
+
+    def forward(self, u):
+        return super().forward(u).double()
 
 
 def test_a_module_that_raises_is_refused_in_words(tmp_path, module):

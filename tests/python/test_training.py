@@ -172,7 +172,7 @@ def test_costs_are_counted_per_sample():
 
 
 def test_without_a_gradient_the_network_cannot_learn():
-    with pytest.raises(ValueError, match="unknown name 'none' for a scene; allowed: implicit, unrolled"):
+    with pytest.raises(ValueError, match="expected implicit or unrolled for this scene, got 'none'"):
         short("heat_1d", backward="none")
 
 

@@ -305,8 +305,8 @@ void Scene::set_backward(const std::string& name) {
   std::vector<std::string> known;
   for (const auto& choice : backwards(*this))
     if (choice.when.holds) known.emplace_back(choice.name);
-  TORCH_CHECK_VALUE(std::find(known.begin(), known.end(), name) != known.end(), "backward: unknown name '", name,
-                    "' for a scene; allowed: ", c10::Join(", ", known));
+  TORCH_CHECK_VALUE(std::find(known.begin(), known.end(), name) != known.end(), "backward: expected ",
+                    c10::Join(" or ", known), " for this scene, got '", name, "'");
   backward = backward_from_name(name);
 }
 
