@@ -16,10 +16,9 @@ from pathlib import Path
 import torch
 
 import prdp_torch as prdp
-from benchmarks import charts, problems
+from benchmarks import problems
 from benchmarks.peers import stencils, torch_eager
 from prdp_torch import operators
-from prdp_torch.experiments.charts import write_png
 
 CURVES = " raise", "eager torch loop", "JAX jit"  # the ways that are timed for several K
 LARGEST_FACTORED = 100_000  # unknowns of a sample, up to which the gradient is compared with that of a direct solve
@@ -136,7 +135,7 @@ def suite(quick):
 
 
 def other_budgets(k, quick):
-    return (2 * k,) if quick else (max(1, k // 4), max(1, k // 2), 2 * k)
+    return (2 * k,) if quick else sorted({max(1, k // 4), max(1, k // 2), 2 * k} - {k})
 
 
 def flows(quick):
@@ -210,11 +209,11 @@ def main():
         print(json.dumps(record), flush=True)
         records.append(record)
     if options.chart:
-        write_png(
-            charts.devices([r for r in records if r.get("way", "").endswith(CURVES) and "k" in r]),
-            options.chart,
-            dpi=110,
-        )
+        from benchmarks import charts
+        from prdp_torch.experiments.charts import write_png
+
+        curves = [r for r in records if r["way"].endswith(CURVES) and "k" in r]
+        write_png(charts.devices(curves), options.chart, dpi=110)
 
 
 if __name__ == "__main__":

@@ -272,9 +272,10 @@ TEST(Stepper, WhatMakesNoStepSaysWhy) {
   const auto u = at::ones({1, 1, 8}, at::kDouble);
   const prdp::Solver cg = prdp::CG{.max_iter = 20};
   auto heat = prdp::Heat({8}, 1e-2, 1.0, cg);
-  EXPECT_EQ(said([&] { heat(at::Tensor()); }), "heat: u is an undefined tensor");
-  EXPECT_EQ(said([&] { heat.rollout(u.to_sparse(), 2); }), "heat: u must be a dense tensor, got the layout Sparse");
-  EXPECT_EQ(said([&] { prdp::Heat({8}, 1e-2, 1.0, prdp::CG{}); }), "heat: max_iter must be given, as a number >= 0");
+  EXPECT_EQ(said([&] { heat(at::Tensor()); }), "Heat: u is an undefined tensor");
+  EXPECT_EQ(said([&] { heat.rollout(u.to_sparse(), 2); }), "Heat: u must be a dense tensor, got the layout Sparse");
+  EXPECT_EQ(said([&] { prdp::Heat({8}, 1e-2, 1.0, prdp::CG{}); }),
+            "Heat: max_iter must be >= 0, got -1, as none was given");
 
   auto step = prdp::ImplicitStep(prdp::diffusion(at::ones({1, 8}, at::kDouble)), nullptr, cg);
   auto flow = prdp::Flow({8, 8}, 1e-2, 1e-3);

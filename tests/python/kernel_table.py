@@ -52,14 +52,20 @@ def kernels_of_sizes(dtype):
 
 
 def kernels_of_large_samples(dtype):
-    """Those of a team, with the numbers of another grid in place of its own."""
-    for label, n, dims, large in (("1024²", 132, 2, "1, 1024, 1024"), ("128³", 26, 3, "128, 128, 128")):
+    """Those of a team of two, with the numbers of another grid and its team in place of its own."""
+    for label, n, dims, large, blocks in (
+        ("1024²", 132, 2, "1, 1024, 1024", 64),
+        ("128³", 26, 3, "128, 128, 128", 128),
+    ):
         shape = (n,) * dims
         a, b = prdp.operators.Diffusion(torch.ones(1, *shape, dtype=dtype), 1.0), noise(1, 1, *shape, dtype=dtype)
         for name, of in {"CG": prdp.CG(1), "CG, multigrid": prdp.CG(1, preconditioner="multigrid")}.items():
             solve(a, b, of, DEVICE)
             for kernel in Fibers().kernels():
                 text = re.sub(r"Grid<\d+, \d+, \d+>", f"Grid<{large}>", kernel.text)
+                text = re.sub(
+                    r"(>, (?:\d, )?)2, (1024|512)", rf"\g<1>{blocks}, \2", text
+                )  # of HierarchySetting, Setting
                 yield f"{name} of diffusion, {label}", [kernel._replace(text=text)]
 
 

@@ -80,6 +80,7 @@ template <class F>
 int with_memory(c10::Device device, const F& call) {
   const int result = call();
   if (result != CudaDriver::kOutOfMemory || captures(device)) return result;
+  const BesideCaptures relaxed;
   if (auto* const memory = dynamic_cast<c10::DeviceAllocator*>(c10::GetAllocator(device.type()))) memory->emptyCache();
   return call();
 }

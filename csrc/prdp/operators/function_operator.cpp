@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <string_view>
 #include <utility>
 
 #include "prdp/error_text.h"
@@ -151,6 +152,17 @@ at::Tensor FunctionOperator::product_without_captures(const at::Tensor& v) const
   return result;  // no graph hangs on it
 }
 
+at::Tensor FunctionOperator::recorded_product(const at::Tensor& v, const std::vector<at::Tensor>& tensors) const {
+  try {
+    return product(registered_->products().apply, v, tensors, product_name());
+  } catch (const std::exception& error) {
+    if (std::string_view(error.what()).find("Inference tensors cannot be saved") == std::string_view::npos) throw;
+  }
+  TORCH_CHECK_VALUE(false, "Function: ", product_name(),
+                    " uses a tensor that was made in inference mode, which autograd ",
+                    "does not record; hand it over in tensors, or give ", transpose_name());
+}
+
 at::Tensor FunctionOperator::derivative_transposed(const at::Tensor& v) const {
   // A v is linear in v, so its derivative is the same everywhere: take it at zero.
   const bool create_graph = at::GradMode::is_enabled();
@@ -158,8 +170,7 @@ at::Tensor FunctionOperator::derivative_transposed(const at::Tensor& v) const {
     auto at_zero = create_graph ? std::nullopt : recorded_;
     if (!at_zero || at_zero->point.sizes() != v.sizes() || at_zero->point.dtype() != v.dtype()) {
       const auto point = at::zeros_like(v).detach().requires_grad_();
-      const auto tensors = create_graph ? tensors_ : detached(tensors_);
-      at_zero = Recorded{point, product(registered_->products().apply, point, tensors, product_name())};
+      at_zero = Recorded{point, recorded_product(point, create_graph ? recordable(tensors_) : detached(tensors_))};
       if (!create_graph) recorded_ = at_zero;
     }
     if (!at_zero->product.requires_grad()) return {};

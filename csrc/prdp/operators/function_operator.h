@@ -37,6 +37,8 @@ class FunctionOperator final : public Operator {
                      const char* name) const;
   at::Tensor product_without_captures(const at::Tensor& v) const;
   at::Tensor derivative_transposed(const at::Tensor& v) const;
+  /// A v for autograd to record; raises ValueError where it cannot.
+  at::Tensor recorded_product(const at::Tensor& v, const std::vector<at::Tensor>& tensors) const;
   at::Tensor norm_of(bool transposed) const;
   /// Raises ValueError where autograd does not follow `apply`, so that no tensor could have a gradient.
   void check_is_recorded(const at::Tensor& u) const;

@@ -103,6 +103,13 @@ inline void add_to(at::Tensor& sum, const at::Tensor& term) {
 inline at::Tensor detached(const at::Tensor& t) {
   return t.is_inference() && !c10::InferenceMode::is_enabled() ? t.clone() : t.detach();
 }
+/// The same tensors, but copies of those of inference mode.
+inline std::vector<at::Tensor> recordable(at::TensorList tensors) {
+  auto found = tensors.vec();
+  for (auto& t : found)
+    if (t.is_inference()) t = detached(t);
+  return found;
+}
 inline std::vector<at::Tensor> detached(at::TensorList tensors) {
   std::vector<at::Tensor> plain;
   for (const auto& t : tensors) plain.push_back(detached(t));

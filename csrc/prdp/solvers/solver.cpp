@@ -2,6 +2,7 @@
 #include <sstream>
 #include <utility>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/solvers/methods.h"
 
@@ -58,10 +59,9 @@ namespace {
 
 void check_budget(const char* who, const char* prefix, const c10::SymInt& max_iter, double rtol) {
   // A symbolic max_iter is checked when its number is known, as the graph runs.
-  TORCH_CHECK_VALUE(max_iter.is_symbolic() || max_iter.expect_int() != kToBeGiven || *prefix, who,
-                    ": max_iter must be given, as a number >= 0");
+  const bool is_missing = !max_iter.is_symbolic() && max_iter.expect_int() == kToBeGiven;
   TORCH_CHECK_VALUE(max_iter.is_symbolic() || max_iter.expect_int() >= 0, who, ": ", prefix,
-                    "max_iter must be >= 0, got ", max_iter);
+                    "max_iter must be >= 0, got ", max_iter, is_missing ? in_language("", ", as none was given") : "");
   TORCH_CHECK_VALUE(rtol >= 0.0, who, ": ", prefix, "rtol must be >= 0, got ", rtol);
   TORCH_CHECK_VALUE(rtol < 1.0, who, ": ", prefix, "rtol must be < 1, got ", rtol, "; u = 0 would meet it");
 }

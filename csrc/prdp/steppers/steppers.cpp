@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include "prdp/operators/kinds.h"
+
 namespace prdp {
 
 namespace {
@@ -18,7 +20,7 @@ std::vector<double> parameters(std::vector<double> first, const Length& length, 
 }  // namespace
 
 Stepper::Stepper(Equation equation, SolveOptions options)
-    : StepperBase(equation.kind, std::move(options)), equation_(std::move(equation)) {
+    : StepperBase(operator_kind(equation.kind).title, std::move(options)), equation_(std::move(equation)) {
   options_.adjoint_log = *log_;
   equation_.check();
 }

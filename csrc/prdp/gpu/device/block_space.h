@@ -232,6 +232,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   };
   /// A row of the Navier-Stokes equations is long, and its text is there once.
   static constexpr bool kIsLong = requires { A::kVelocity; };
+  /// Where a row has loads enough, those of others need not be under way with them.
   static constexpr int kRowsAtOnce = requires { A::kLoadsEnough; } ? 1 : kCellsAtOnce;
   /// store(i, (A v)_i) for this thread's cells. Slower threads still read v: between a product and the next write to v
   /// there must be a barrier, which a sum or another product has. Every method has one; a test leaves them out in turn.

@@ -135,7 +135,9 @@ class BlockVectors {
   /// once, which leaves less to compile.
   template <int kAtOnce = kCellsAtOnce, class F, class Store>
   void each(const F& f, const Store& store) const {
-    team_.template each<kAtOnce>(A::kUnknowns, f, store);
+    constexpr int of_block = (A::kUnknowns + S::kBlocks - 1) / S::kBlocks;
+    constexpr int rounds = (of_block + S::kThreads - 1) / S::kThreads, passes = (rounds + kAtOnce - 1) / kAtOnce;
+    team_.template each<(rounds + passes - 1) / passes>(A::kUnknowns, f, store);
   }
   static auto into(Vector v) {
     return [v](int i, T value) { v[i] = value; };

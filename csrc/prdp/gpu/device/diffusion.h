@@ -34,7 +34,7 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
   /// Whether the shift and the Robin sides alone hold u, and A is singular where they are zero.
   static constexpr bool kMayBeUnheld = ((kSides != kZeroSide) && ...);
 
-  static constexpr bool kLoadsEnough = true;  // in a row: those of other rows need not be under way with them
+  static constexpr bool kLoadsEnough = true;
 
   using Cycled = Diffusion;
   using Points = G;

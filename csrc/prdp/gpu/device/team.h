@@ -26,12 +26,14 @@ class Team {
   bool is_first_block() const { return rank_ == 0; }
   bool leads() const { return rank_ == 0 && threadIdx.x == 0; }
 
-  /// f(i), and then store(i, f(i)), for each of this thread's share of 0 … n - 1. f only reads.
+  /// f(i), and then store(i, f(i)), for each of this thread's share of 0 … n - 1. f only reads, and may be called
+  /// twice.
   template <int kAtOnce = kCellsAtOnce, class F, class Store>
   void each(int n, const F& f, const Store& store) const {
     const Share mine = share_of(n);
     PRDP_NO_UNROLL for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end;
                         first += kThreads * kAtOnce) {
+      if (kAtOnce > 1 && mine.end - mine.begin <= kThreads) return store(first, f(first));
       decltype(f(0)) value[kAtOnce];
       PRDP_UNROLL for (int k = 0; k < kAtOnce; ++k) {
         const int i = first + k * kThreads;

@@ -233,6 +233,7 @@ class Stencil
 template <class T, int n, bool kTransposed>
 class Dense : public OperatorRows<Dense<T, n, kTransposed>, T> {
  public:
+  static constexpr bool kLoadsEnough = true;
   static constexpr int kUnknowns = n;
 
   Dense(const OperatorArguments& a, int64_t sample)
@@ -252,6 +253,7 @@ class Dense : public OperatorRows<Dense<T, n, kTransposed>, T> {
 template <class T, int n>
 class Csr : public OperatorRows<Csr<T, n>, T> {
  public:
+  static constexpr bool kLoadsEnough = true;
   static constexpr int kUnknowns = n;
 
   Csr(const OperatorArguments& a, int64_t sample)

@@ -63,7 +63,8 @@ int64_t FlowBox::open_axis() const {
 
 bool FlowBox::is_held() const {
   const auto holds = [](FlowBoundary boundary) { return boundary != FlowBoundary::kPeriodic; };
-  return obstacle_.defined() || std::any_of(boundary_.begin(), boundary_.end(), holds);
+  return (obstacle_.defined() && obstacle_.any().item<bool>()) ||
+         std::any_of(boundary_.begin(), boundary_.end(), holds);
 }
 
 double FlowBox::sum_of_couplings() const {

@@ -92,7 +92,7 @@ std::string name_of_wall(size_t i) {
   return c10::str("wall_velocity of side (", i / 2, ", ", end, ")");
 }
 
-double FlowEquation::checked_diffusion_number() const {
+double FlowEquation::check() const {
   TORCH_CHECK_VALUE(box && nu.defined(), "Flow: an equation needs a box and nu; one that was moved from has none");
   for (const auto& t : tensors())
     TORCH_CHECK_VALUE(!t.defined() || !t.is_meta(), "Flow: a tensor of it is on meta, where it has no values: give it ",
@@ -115,9 +115,7 @@ double FlowEquation::checked_diffusion_number() const {
   return number;
 }
 
-void FlowEquation::check() const { checked_diffusion_number(); }
-
-void FlowEquation::check(const at::Tensor& u) const {
+double FlowEquation::check(const at::Tensor& u) const {
   TORCH_CHECK_TYPE(!at::tracer::impl::is_dispatch_enabled(),
                    "Flow: torch.jit.trace cannot record it; take torch.compile");
   auto all = tensors();
@@ -125,12 +123,8 @@ void FlowEquation::check(const at::Tensor& u) const {
   TORCH_CHECK_NOT_IMPLEMENTED(!in_torch_func() || !at::areAnyTensorSubclassLike(all),
                               "Flow: takes no transform of torch.func; use autograd.grad and batches");
   TORCH_CHECK_NOT_IMPLEMENTED(!any_tangent(all), "Flow: takes no dual tensors of forward mode; use autograd.grad");
-  const double number = checked_diffusion_number();
+  const double number = check();
   box->check_velocity(u);
-  constexpr double most = 1e6;  // beyond, 1 is rounding beside the coefficients of I - nu dt Δ
-  TORCH_CHECK_VALUE(number <= most || !is_diffused_implicitly() || u.scalar_type() == at::kDouble || box->is_held(),
-                    "Flow: float32 loses the mean velocity of a periodic box where nu dt Σ 2/dx² > ", most, ", got ",
-                    number, "; take float64 or a smaller dt");
   const auto check_batch = [&](const std::string& name, const at::Tensor& t) {
     TORCH_CHECK_VALUE(!t.defined() || t.dim() == 1 || t.size(0) == 1 || t.size(0) == u.size(0), "Flow: ", name,
                       " holds ", t.size(0), " samples, u holds ", u.size(0));
@@ -138,6 +132,15 @@ void FlowEquation::check(const at::Tensor& u) const {
   check_batch("force", force);
   check_batch("inflow", inflow);
   for (size_t i = 0; i < wall_velocity.size(); ++i) check_batch(name_of_wall(i), wall_velocity[i]);
+  return number;
+}
+
+void FlowEquation::check_step(const at::Tensor& u) const {
+  const double number = check(u);
+  constexpr double most = 1e6;  // beyond, 1 is rounding beside the coefficients of I - nu dt Δ
+  TORCH_CHECK_VALUE(number <= most || !is_diffused_implicitly() || u.scalar_type() == at::kDouble || box->is_held(),
+                    "Flow: float32 loses the mean velocity of a periodic box where nu dt Σ 2/dx² > ", most, ", got ",
+                    number, "; take float64 or a smaller dt");
 }
 
 FlowEquation FlowEquation::for_state(const at::Tensor& u) const {

@@ -37,10 +37,12 @@ struct FlowEquation {
   FlowPressure pressure = FlowPressure::kIncremental;
 
   bool is_diffused_implicitly() const { return diffusion == FlowDiffusion::kImplicit; }
-  /// Raises ValueError or TypeError for what is out of range or does not fit the box.
-  void check() const;
+  /// Raises ValueError or TypeError for what is out of range or does not fit the box. Returns nu dt Σ 2/dx².
+  double check() const;
   /// And for what does not fit the state.
-  void check(const at::Tensor& u) const;
+  double check(const at::Tensor& u) const;
+  /// And where a step in the dtype of the state would lose its mean.
+  void check_step(const at::Tensor& u) const;
   /// The tensors in the dtype and on the device of a state; all but nu with all their axes.
   FlowEquation for_state(const at::Tensor& u) const;
   /// The tensors that may have a gradient.
@@ -48,10 +50,6 @@ struct FlowEquation {
   FlowEquation with_tensors(at::TensorList tensors) const;
   /// The velocity of the wall at an end of an axis; undefined at rest.
   at::Tensor velocity_of_wall(int64_t axis, bool high) const;
-
- private:
-  /// check(); returns nu dt Σ 2/dx².
-  double checked_diffusion_number() const;
 };
 
 /// "wall_velocity of side (0, 'high')", for the i-th of FlowEquation::wall_velocity.

@@ -84,7 +84,10 @@ at::Tensor Flow::rollout(const at::Tensor& u, int64_t steps) {
 }
 
 at::Tensor Flow::project(const at::Tensor& u) const { return flow_project(equation_, u, options_); }
-at::Tensor Flow::pressure(const at::Tensor& u) const { return flow_pressure(equation_, u, options_); }
+at::Tensor Flow::pressure(const at::Tensor& u) const {
+  check_start(options_);
+  return flow_pressure(equation_, u, options_);
+}
 at::Tensor Flow::divergence(const at::Tensor& u) const { return flow_divergence_of_state(equation_, u); }
 
 }  // namespace prdp
