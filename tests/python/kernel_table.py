@@ -63,9 +63,7 @@ def kernels_of_large_samples(dtype):
             solve(a, b, of, DEVICE)
             for kernel in Fibers().kernels():
                 text = re.sub(r"Grid<\d+, \d+, \d+>", f"Grid<{large}>", kernel.text)
-                text = re.sub(
-                    r"(>, (?:\d, )?)2, (1024|512)", rf"\g<1>{blocks}, \2", text
-                )  # of HierarchySetting, Setting
+                text = re.sub(r"(>, (?:\d, )?)2, (1024|512)", rf"\g<1>{blocks}, \2", text)
                 yield f"{name} of diffusion, {label}", [kernel._replace(text=text)]
 
 

@@ -38,14 +38,14 @@ BAD = {
     "mask that fills": ({"obstacle": ~solid((8, 6))}, ValueError, "the obstacle fills the grid"),
     "force": ({"force": torch.zeros(3)}, ValueError, "force must have shape (2,) or (batch or 1, 2, 8, 6), got [3]"),
     "words as force": ({"force": "down"}, TypeError, "force must be a tensor or a tuple of numbers, got 'down'"),
-    "inflow": ({"inflow": (1.0, 0.0)}, ValueError, "inflow is for an 'open' axis"),
-    "no inflow": ({"boundary": ("wall", "open")}, ValueError, "an 'open' axis needs inflow"),
+    "inflow": ({"inflow": (1.0, 0.0)}, ValueError, "inflow is for an open axis"),
+    "no inflow": ({"boundary": ("wall", "open")}, ValueError, "an open axis needs inflow"),
     "inflow of another shape": (
         {"boundary": ("wall", "open"), "inflow": torch.zeros(1, 2, 8, 6)},
         ValueError,
         "inflow must have shape (2,) or (batch or 1, 2, 8, 1), got [1, 2, 8, 6]",
     ),
-    "two open axes": ({"boundary": "open", "inflow": (1.0, 0.0)}, ValueError, "at most one axis may be 'open'"),
+    "two open axes": ({"boundary": "open", "inflow": (1.0, 0.0)}, ValueError, "at most one axis may be open"),
     "inflow that cannot leave": (
         {"boundary": ("wall", "open"), "inflow": (1.0, 0.0), "obstacle": solid((8, 6), (slice(None), 3))},
         ValueError,

@@ -49,7 +49,7 @@ Run::Run(const Scene& scene, const Refinement& refinement, int64_t seed, Checkpo
       controller_(refinement.controller()),
       checkpoint_(checkpoint),
       found_(checkpoint.find()) {
-  if (refinement.start)
+  if (refinement.start && !scene.physics.is_kolmogorov())  // the solves of a Flow are for changes
     for (auto* stepper : steppers_) stepper->options().start = *refinement.start;
   take_budget();
 }
