@@ -41,8 +41,8 @@ struct FlowEquation {
   double check() const;
   /// And for what does not fit the state.
   double check(const at::Tensor& u) const;
-  /// And where a step in the dtype of the state would lose its mean.
-  void check_step(const at::Tensor& u) const;
+  /// And, for so many steps, where one in the dtype of the state would lose its mean.
+  void check_steps(const at::Tensor& u, int64_t steps) const;
   /// The tensors in the dtype and on the device of a state; all but nu with all their axes.
   FlowEquation for_state(const at::Tensor& u) const;
   /// The tensors that may have a gradient.

@@ -21,7 +21,7 @@ SolveResult one_step(const FlowEquation& equation, const at::Tensor& u, FlowOutp
                      const SolveOptions& options) {
   if (options.backward != Backward::kUnrolled) return flow_steps(equation, u, 1, output, options);
   options.check("Flow");
-  equation.check_step(u);
+  equation.check_steps(u, 1);
   return unrolled_step(equation, u, options, output);
 }
 
@@ -33,7 +33,7 @@ bool is_diffused_with_pressure(const FlowEquation& e) {
 SolveResult unrolled_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
                              const SolveOptions& options) {
   options.check("Flow");
-  steps > 0 ? equation.check_step(u) : static_cast<void>(equation.check(u));
+  equation.check_steps(u, steps);
   return solve_by_solve(u, steps, 1,
                         [&](const at::Tensor& state, int64_t) { return unrolled_step(equation, state, options); });
 }

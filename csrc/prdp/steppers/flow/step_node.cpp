@@ -140,7 +140,7 @@ at::Tensor output_of(const FlowStep& step, FlowOutput output, double dt) {
 SolveResult flow_steps(const FlowEquation& equation, const at::Tensor& u, int64_t steps, FlowOutput output,
                        const SolveOptions& options) {
   options.check("Flow");
-  steps > 0 ? equation.check_step(u) : static_cast<void>(equation.check(u));
+  equation.check_steps(u, steps);
   const WithoutAutocast full_precision;
   bool differentiable = at::GradMode::is_enabled() && u.requires_grad();
   for (const auto& t : equation.tensors())
