@@ -9,6 +9,7 @@ from helpers import written
 from typer.testing import CliRunner
 
 from prdp_torch.experiments import cli, compare, records, scenes
+from prdp_torch.experiments.checkpoint import difference
 from prdp_torch.experiments.refinement import Refinement
 
 TRAINER = Path(__file__).parents[2] / "build" / "prdp_train"
@@ -90,3 +91,12 @@ def test_finished_records_that_are_replaced_are_told_before(tmp_path):
     assert prdp(*train, "--backward", "unrolled", "--resume", "--seeds", 2) == (0, words)
     record.write_text("damaged")
     assert prdp(*train) == (0, f"prdp: replaces when it ends: '{record}', which is damaged\n")
+
+
+def test_of_files_that_differ_it_is_said_which():
+    there, here = (
+        {"data": "1f", "network": "2a", "backward": "none"},
+        {"data": "1f", "network": "2b", "backward": "none"},
+    )
+    assert difference(there, here) == "the module of the network has changed"
+    assert difference(there, {**there, "data": "1e"}) == "the file of the data has changed"
