@@ -1,5 +1,7 @@
 #include <torch/csrc/autograd/autograd.h>
 
+#include <algorithm>
+
 #include "prdp/autograd/tape_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
@@ -60,19 +62,20 @@ UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Unr
 
   const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const int64_t most = size == 0 ? 0 : iterations.max().item<int64_t>();
-  const int64_t grain = grain_size(solve.solver.method, size, unknowns, 4 * most, solve.solver.restart);
+  constexpr int64_t cost_of_reverse = 4;  // iterations that one takes, there and back
+  const int64_t grain = grain_size(solve.solver.method, size, unknowns, cost_of_reverse * most, solve.solver.restart);
   const auto run = [&]<class T>(const kernels::KernelBatch<T>& of_a) {
-    ReverseBatch<T> batch{solve.solver,
-                          solve.checkpoint_every,
-                          iterations.const_data_ptr<int64_t>(),
-                          rhs.const_data_ptr<T>(),
-                          x0.defined() ? x0.const_data_ptr<T>() : nullptr,
-                          bar.const_data_ptr<T>(),
-                          b_bar.mutable_data_ptr<T>(),
-                          for_diagonal ? diagonal_bar.mutable_data_ptr<T>() : nullptr,
-                          found.operator_applications.mutable_data_ptr<int64_t>(),
-                          {},
-                          {}};
+    ReverseBatch<T> batch{.solver = solve.solver,
+                          .checkpoint_every = solve.checkpoint_every,
+                          .iterations = iterations.const_data_ptr<int64_t>(),
+                          .b = rhs.const_data_ptr<T>(),
+                          .x0 = x0.defined() ? x0.const_data_ptr<T>() : nullptr,
+                          .cotangent = bar.const_data_ptr<T>(),
+                          .b_bar = b_bar.mutable_data_ptr<T>(),
+                          .diagonal_bar = for_diagonal ? diagonal_bar.mutable_data_ptr<T>() : nullptr,
+                          .applications = found.operator_applications.mutable_data_ptr<int64_t>(),
+                          .rows = {},
+                          .take_gradients = {}};
     if (for_a) {
       batch.rows = [&](int64_t s) { return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs); };
       batch.take_gradients = [&](int64_t s, std::vector<at::Tensor> g) { of_samples[s] = std::move(g); };

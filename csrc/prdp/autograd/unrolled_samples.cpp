@@ -51,9 +51,9 @@ class SampleVjps {
 
  private:
   struct Differentiated {
-    std::vector<at::Tensor> gradients;    // summed over samples
+    std::vector<at::Tensor> gradients;  // summed over samples; leave_out_failed_adjoints() takes some out, here alone
     std::vector<SampleOutcome> outcomes;  // of each sample
-    Rows finite;                          // the samples whose gradient is
+    Rows finite;  // the samples whose gradient is
   };
 
   const at::Tensor& cotangent_;
@@ -165,7 +165,7 @@ class SampleVjps {
       if (!rows[i]) continue;
       const auto said = static_cast<SolveStatus>(statuses[i]);
       const bool has_none = is_refused(said) || said == SolveStatus::kOverflow;  // no gradient, whatever its residual
-      const bool good = statuses[i] < 0 && !has_none && residual[i] <= judged_rtol_;
+      const bool good = !is_solved(said) && !has_none && residual[i] <= judged_rtol_;
       outcomes[i] = {good ? SolveStatus::kConverged : said, iterations[i], products[i], residual[i]};
     }
   }

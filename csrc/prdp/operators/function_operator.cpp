@@ -74,6 +74,30 @@ class AsOutside {
 /// How often a tensor was written to; unknown in inference mode.
 int64_t writes(const at::Tensor& t) { return t.is_inference() ? 0 : static_cast<int64_t>(t._version()); }
 
+/// The arguments of a product, which it must leave as they are.
+class Arguments {
+ public:
+  Arguments(const at::Tensor& v, const std::vector<at::Tensor>& tensors, bool compares_numbers)
+      : v_(v), tensors_(tensors), before_(all_writes()), copy_(compares_numbers ? v.clone() : at::Tensor()) {}
+  void check_unchanged(const char* name) const {
+    const bool is_unchanged =
+        all_writes() == before_ && (!copy_.defined() || at::allclose(v_, copy_, 0.0, 0.0, /*equal_nan=*/true));
+    TORCH_CHECK_VALUE(is_unchanged, "Function: ", name,
+                      " changes its arguments in place; it must return a new tensor and leave them as they are");
+  }
+
+ private:
+  int64_t all_writes() const {
+    int64_t sum = writes(v_);
+    for (const auto& t : tensors_) sum += writes(t);
+    return sum;
+  }
+  const at::Tensor& v_;
+  const std::vector<at::Tensor>& tensors_;
+  int64_t before_;
+  at::Tensor copy_;  // of v in inference mode, where nobody counts what is written
+};
+
 /// Whether a tensor may have a gradient, and entries that are not finite. Complex ones are symbols of spectral
 /// operators.
 bool holds_numbers(const at::Tensor& t) {
@@ -82,7 +106,7 @@ bool holds_numbers(const at::Tensor& t) {
 
 const char* transpose_name() { return in_language("transpose", "apply_transpose"); }
 
-at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) {
+at::Tensor solve_with(const at::Tensor& matrix, const at::Tensor& b) {
   return solve_dense(matrix, b.flatten(1).unsqueeze(-1)).reshape_as(b);
 }
 
@@ -124,23 +148,15 @@ bool FunctionOperator::in_transform(const at::Tensor& v) const {
 
 at::Tensor FunctionOperator::product(const Products::Product& function, const at::Tensor& v,
                                      const std::vector<at::Tensor>& tensors, const char* name) const {
-  const auto of_all = [&] {
-    auto sum = writes(v);
-    for (const auto& t : tensors) sum += writes(t);
-    return sum;
-  };
-  const auto before = of_all();
   const bool is_first = v.is_inference() && v.is_cpu() && is_plain(v) && !std::exchange(looked_in_inference_, true);
-  const auto copy = is_first ? v.clone() : at::Tensor();
+  const Arguments arguments(v, tensors, /*compares_numbers=*/is_first);
   const auto call = [&] {
     if (in_torch_func()) return function(v, tensors);
     const AsOutside as_outside;
     return function(v, tensors);
   };
   const auto result = checked(call(), v, name);
-  const bool is_unchanged = of_all() == before && (!is_first || at::allclose(v, copy, 0.0, 0.0, /*equal_nan=*/true));
-  TORCH_CHECK_VALUE(is_unchanged, "Function: ", name,
-                    " changes its arguments in place; it must return a new tensor and leave them as they are");
+  arguments.check_unchanged(name);
   return result;
 }
 
@@ -207,7 +223,7 @@ at::Tensor FunctionOperator::solve_directly(const at::Tensor& b, bool transposed
   check_dense_fits(b, b.numel() / std::max<int64_t>(b.size(0), 1), b.size(0));
   const auto matrix = matrix_by_columns(product, b);
   norms_of_matrix_[transposed] = matrix.detach().abs().sum(-1).amax(-1).to(at::kDouble);
-  return solve(matrix, b);
+  return solve_with(matrix, b);
 }
 
 std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {

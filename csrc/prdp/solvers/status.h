@@ -29,6 +29,7 @@ struct StatusText {
 const std::vector<StatusText>& solve_statuses();
 const char* name(SolveStatus status);
 
+inline bool is_solved(SolveStatus status) { return static_cast<int64_t>(status) > 0; }
 /// Whether the sample failed, which raises an error by default. After MAX_ITER and STAGNATED the iterate is usable.
 inline bool is_failure(SolveStatus status) {
   return static_cast<int64_t>(status) < static_cast<int64_t>(SolveStatus::kStagnated);

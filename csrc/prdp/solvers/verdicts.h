@@ -124,7 +124,7 @@ void note_underflow(SampleState& s, double largest) {
   const double lost = largest == 0.0 ? 1.0 : std::numeric_limits<T>::denorm_min() / largest;
   if (s.residual2 >= lost * lost * s.b2) return;
   s.residual2 = s.floor2 = lost * lost * s.b2;
-  if (static_cast<int64_t>(s.status) > 0) s.status = SolveStatus::kStagnated;
+  if (is_solved(s.status)) s.status = SolveStatus::kStagnated;
 }
 
 // ---- its end

@@ -38,10 +38,7 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
 
   using Cycled = Diffusion;
   using Points = G;
-  static constexpr bool periodic(int axis) {
-    constexpr int sides[] = {kSides...};
-    return (axis == 0 ? sides[0] : axis == 1 ? sides[2] : sides[4]) == kPeriodicSide;
-  }
+  static constexpr bool periodic(int axis) { return side(axis, 0) == kPeriodicSide; }
   /// NaN where κ is not allowed.
   T largest_in_row(int i) const {
     bool allowed = true;
@@ -90,6 +87,11 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
   struct Nothing {
     void operator()(T, int, int) const {}
   };
+  /// Of the low end of an axis, 0, or of its high one, 1.
+  static constexpr int side(int axis, int end) {
+    constexpr int sides[] = {kSides...};
+    return sides[2 * axis + end];
+  }
   /// f(c, j, axis, cells) for each face to a neighbour j, so many cells along the axis, and beyond(c, axis, cells) for
   /// each on a side that holds u; returns the shift and what the sides hold.
   template <class F, class Beyond = Nothing>
@@ -113,8 +115,8 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
   /// The neighbour beyond a face, or -1.
   template <int axis, int end>
   static int neighbour(const G& at) {
-    constexpr int sides[] = {kSides...}, extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
-    constexpr bool wraps = sides[2 * axis + end] == kPeriodicSide && n > 1;
+    constexpr int extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
+    constexpr bool wraps = side(axis, end) == kPeriodicSide && n > 1;
     const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x;
     const int next = moved<n, end == 0 ? -1 : 1, wraps>(here);
     constexpr int stride = axis == 0 ? G::kY * G::kX : axis == 1 ? G::kX : 1;
@@ -139,15 +141,14 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
   };
   template <int axis, int end, class F, class Beyond>
   T face(const G& at, int i, const Around& around, const F& f, const Beyond& beyond) const {
-    constexpr int sides[] = {kSides...};
-    constexpr int side = sides[2 * axis + end], cells = end == 0 ? -1 : 1;
+    constexpr int cells = end == 0 ? -1 : 1;
     const int point = at.point(), there = neighbour<axis, end>(at);
     const T scale = inverse_width_[axis] * inverse_width_[axis], kappa = kappa_of(axis)[point];
     if (there >= 0) {
       f(scale * mean(kappa, around.of[2 * axis + end]), i - point + there, axis, cells);
       return 0;
     }
-    if constexpr (side != kZeroSide && side != kRobinSide) return 0;
+    if constexpr (side(axis, end) != kZeroSide && side(axis, end) != kRobinSide) return 0;
     const T conductance = side_conductance<axis, end>(at, 2 * scale * kappa);
     beyond(conductance, axis, cells);
     return conductance;
@@ -155,8 +156,7 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
   /// By the side, half a cell away.
   template <int axis, int end>
   T side_conductance(const G& at, T within) const {
-    constexpr int sides[] = {kSides...};
-    if constexpr (sides[2 * axis + end] == kZeroSide) return within;
+    if constexpr (side(axis, end) == kZeroSide) return within;
     constexpr int at_side = 2 * axis + end;
     const int on_side = axis == 0 ? at.y * G::kX + at.x : axis == 1 ? at.z * G::kX + at.x : at.z * G::kY + at.y;
     const T h = robin_[at_side] ? robin_[at_side][on_side] : robin_number_[at_side];

@@ -27,6 +27,13 @@ struct Call : torch::CustomClassHolder {
   std::shared_ptr<const RegisteredProducts> products;  // of the preconditioner
 };
 
+/// The tensors that the backward pass finds again, in this order.
+enum Saved : size_t {
+  kState,    // u, or of a rollout all its states
+  kStatus,   // undefined where failures raise
+  kTensors,  // from here on, those of the equation
+};
+
 /// Functions of autograd take no undefined tensors: an empty one stands for none.
 std::vector<at::Tensor> or_empty(std::vector<at::Tensor> tensors, const at::Tensor& u) {
   for (auto& t : tensors)
@@ -74,15 +81,15 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
     const auto saved = ctx->get_saved_variables();
     const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
-    const auto tensors = at::TensorList(saved).slice(2);
+    const auto tensors = at::TensorList(saved).slice(kTensors);
     variable_list out(tensors.size() + 2);
     if (!grads[0].defined()) return out;
     const auto equation = call->equation.with_tensors(or_undefined(tensors));
     std::vector<int64_t> needed(tensors.size() + 1);
     for (size_t i = 0; i < needed.size(); ++i) needed[i] = ctx->needs_input_grad(i);
     const auto of_cotangent = [&](const at::Tensor& cotangent) {
-      return call->output == FlowOutput::kStates ? states_vjp(equation, saved[0], saved[1], cotangent, *call, needed)
-                                                 : step_vjp(equation, saved[0], saved[1], cotangent, *call, needed);
+      const auto vjp = call->output == FlowOutput::kStates ? states_vjp : step_vjp;
+      return vjp(equation, saved[kState], saved[kStatus], cotangent, *call, needed);
     };
     const WithoutAutocast full_precision;
     const auto found = for_each_cotangent(grads[0], of_cotangent);
