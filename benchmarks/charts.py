@@ -86,8 +86,9 @@ def devices(records):
     """For each problem, the error over the time of a solve with its gradient, as K grows. The error is that of the
     gradient where it is known, else the residual."""
     titles = list(dict.fromkeys(r["problem"] for r in records))
-    figure = Figure(figsize=(3.7 * min(len(titles), 4), 3.4 * -(-len(titles) // 4)), layout="constrained")
-    panels = figure.subplots(-(-len(titles) // 4), min(len(titles), 4), squeeze=False).flat
+    rows, columns = -(-len(titles) // 4), min(len(titles), 4)
+    figure = Figure(figsize=(3.7 * columns, 3.4 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).flat
     for axes, title in zip(panels, titles, strict=False):
         of_problem = [r for r in records if r["problem"] == title]
         for way in dict.fromkeys(r["way"] for r in of_problem):

@@ -204,7 +204,7 @@ def export(
 ) -> None:
     """Write the trajectories of a scene as HDF5 or .npz, in PDEBench's layout."""
     loaded = scene_files.load(scene)
-    if not loaded.trains_network or loaded.physics.equation == "darcy":
+    if not trajectories.exist(loaded):
         raise ValueError(f"export: the scene {loaded.name} has no trajectories")
     path = out or Path(f"{loaded.name}.h5")
     array_files.check_name(path)

@@ -42,13 +42,18 @@ class Trajectories:
     """Titles of the trainings that left no weights, or diverged."""
 
 
+def exist(scene: _C.Scene) -> bool:
+    """Whether the network of a scene is trained on states that follow each other in time."""
+    return scene.trains_network and scene.physics.equation != "darcy"
+
+
 def collect(scene: _C.Scene, rows: list[Row], folder: Path, on_data: OnData | None = None) -> Trajectories | None:
     """Follow the validation samples with the networks of converged training, of auto and of PRDP, whose weights
     lie beside their records in `folder`. None for a task without a network or without time, or if there are no weights.
 
     on_data: called while the reference is made with (steps of a sample done, all of them).
     """
-    if not scene.trains_network or scene.physics.equation == "darcy":
+    if not exist(scene):
         return None
     rows = [row for row in rows if row.kind in _SHOWN]
     networks = {row.label: _networks(scene, row, folder) for row in rows}

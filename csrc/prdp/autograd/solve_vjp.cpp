@@ -75,30 +75,19 @@ void report_overflow(SolveInfo& info, const Rows& finite, const OperatorSpec& tr
                   options.on_failure);
 }
 
-/// Stores what product(λ, of A) gives for the tensors of A, as a kernel does: the host looks at nothing, and a sample
-/// whose ḡ leaves the range of the dtype gets zeros and OVERFLOW.
+/// The products for the tensors of A where the host may look: it sums, looks, and sums again without the samples that
+/// overflowed, which lose b̄ as well and are reported.
 template <class Products>
-void take_products_on_device(SolveVjp& found, at::Tensor lambda, const at::Tensor& u, const OperatorSpec& a,
-                             const SolveOptions& o, bool needs_b, const Products& products_of) {
-  leave_out_overflow_on_device(lambda, u, found.info.status);
-  if (needs_b) found.gradients[0] = lambda;
-  if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
-  const auto products = products_of(*make_operator(a), lambda);
-  std::copy(products.begin(), products.end(), found.gradients.begin() + 1);
-}
-
-/// The same where the host may look: it sums, looks, and sums again without the samples that overflowed.
-template <class Products>
-void take_products_by_sample(SolveVjp& found, const at::Tensor& lambda, const at::Tensor& cotangent,
-                             const OperatorSpec& a, const OperatorSpec& transpose, const SolveOptions& o, bool needs_b,
-                             const Products& products_of) {
+std::vector<at::Tensor> products_by_sample(SolveVjp& found, const at::Tensor& lambda, const at::Tensor& cotangent,
+                                           const OperatorSpec& a, const OperatorSpec& transpose, const SolveOptions& o,
+                                           const Products& products_of) {
   const auto healthy = make_operator(with_healthy_tensors(a, not_refused(found.info.status)));
   Rows finite(cotangent.size(0), true);
-  const auto products = finite_sum(finite, [&](const Rows& some) { return products_of(*healthy, only(lambda, some)); });
-  std::copy(products.begin(), products.end(), found.gradients.begin() + 1);
-  if (all(finite)) return;
-  if (needs_b) found.gradients[0] = only(lambda, finite);
+  auto products = finite_sum(finite, [&](const Rows& some) { return products_of(*healthy, only(lambda, some)); });
+  if (all(finite)) return products;
+  if (auto& b_bar = found.gradients[0]; b_bar.defined()) b_bar = only(lambda, finite);
   report_overflow(found.info, finite, transpose, cotangent, o);
+  return products;
 }
 
 }  // namespace
@@ -121,15 +110,19 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
       products[i] = needed[i + 1] && products[i].defined() ? products[i].neg() : at::Tensor();
     return products;
   };
+  std::vector<at::Tensor> products;
   // An overflow of ḡ must stay with its sample.
   if (!waits_for_report(o) && gpu::may_run_kernel(cotangent, o.solver) && !in_torch_func()) {
-    take_products_on_device(found, lambda, u, a, o, needed[0], products_of);
+    leave_out_overflow_on_device(lambda, u, found.info.status);
+    if (needed[0]) found.gradients[0] = lambda;
+    if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
+    products = products_of(*make_operator(a), lambda);
   } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
-    const auto products = products_of(*make_operator(a), lambda);
-    std::copy(products.begin(), products.end(), found.gradients.begin() + 1);
+    products = products_of(*make_operator(a), lambda);
   } else {
-    take_products_by_sample(found, lambda, cotangent, a, transpose, o, needed[0], products_of);
+    products = products_by_sample(found, lambda, cotangent, a, transpose, o, products_of);
   }
+  std::copy(products.begin(), products.end(), found.gradients.begin() + 1);
   return found;
 }
 

@@ -65,12 +65,14 @@ bool captures(c10::Device device) {
 /// While it lives, this thread may load a kernel though another one captures a graph, which that would spoil.
 class BesideCaptures {
  public:
-  BesideCaptures() { exchange(); }
+  BesideCaptures() {
+    const auto& driver = CudaDriver::get();
+    driver.check(driver.exchange_capture_mode(&mode_), "no mode of capture");
+  }
   BesideCaptures(const BesideCaptures&) = delete;
   ~BesideCaptures() { CudaDriver::get().exchange_capture_mode(&mode_); }
 
  private:
-  void exchange() { CudaDriver::get().check(CudaDriver::get().exchange_capture_mode(&mode_), "no mode of capture"); }
   int mode_ = 2;  // CU_STREAM_CAPTURE_MODE_RELAXED; then that of before
 };
 

@@ -1,8 +1,8 @@
 #include "prdp/steppers/flow/flow.h"
 
-#include "prdp/error_text.h"
 #include "prdp/steppers/flow/projection.h"
 #include "prdp/steppers/flow/rollout.h"
+#include "prdp/steppers/flow/step_node.h"
 #include "prdp/steppers/flow/tendency.h"
 
 namespace prdp {
@@ -19,11 +19,6 @@ FlowEquation make_equation(std::vector<int64_t> shape, Viscosity nu, double dt, 
   }
   return {std::move(box),   dt,          std::move(nu.tensor), s.force,   s.inflow,
           std::move(walls), s.advection, s.diffusion,          s.pressure};
-}
-
-void check_start(const SolveOptions& options) {
-  TORCH_CHECK_VALUE(options.start == Start::kZero, "Flow: start must be ", in_language("'zero'", "Start::kZero"),
-                    ": its solves are for changes");
 }
 
 SolveOptions without_log(SolveOptions options) {
@@ -53,7 +48,7 @@ at::Tensor flow_divergence_of_state(const FlowEquation& equation, const at::Tens
 Flow::Flow(FlowEquation equation, SolveOptions options)
     : StepperBase("Flow", std::move(options)), equation_(std::move(equation)) {
   options_.adjoint_log = *log_;
-  check_start(options_);
+  check_flow_options(options_);
   equation_.check();
 }
 
@@ -61,33 +56,21 @@ Flow::Flow(std::vector<int64_t> shape, Viscosity nu, double dt, FlowSettings set
     : Flow(make_equation(std::move(shape), std::move(nu), dt, std::move(settings)), {std::move(solver), backward}) {}
 
 at::Tensor Flow::operator()(const at::Tensor& u) {
-  return reported(u, [&] {
-    check_start(options_);
-    return flow_next(equation_, u, options_);
-  });
+  return reported(u, [&] { return flow_next(equation_, u, options_); });
 }
 
 std::pair<at::Tensor, at::Tensor> Flow::step_and_pressure(const at::Tensor& u) {
-  const auto both = reported(u, [&] {
-    check_start(options_);
-    return flow_next_and_pressure(equation_, u, options_);
-  });
+  const auto both = reported(u, [&] { return flow_next_and_pressure(equation_, u, options_); });
   const int64_t d = equation_.box->dim();
   return {both.narrow(1, 0, d), both.narrow(1, d, 1)};
 }
 
 at::Tensor Flow::rollout(const at::Tensor& u, int64_t steps) {
-  return reported(u, [&] {
-    check_start(options_);
-    return flow_rollout(equation_, u, steps, options_);
-  });
+  return reported(u, [&] { return flow_rollout(equation_, u, steps, options_); });
 }
 
 at::Tensor Flow::project(const at::Tensor& u) const { return flow_project(equation_, u, options_); }
-at::Tensor Flow::pressure(const at::Tensor& u) const {
-  check_start(options_);
-  return flow_pressure(equation_, u, options_);
-}
+at::Tensor Flow::pressure(const at::Tensor& u) const { return flow_pressure(equation_, u, options_); }
 at::Tensor Flow::divergence(const at::Tensor& u) const { return flow_divergence_of_state(equation_, u); }
 
 }  // namespace prdp

@@ -20,7 +20,7 @@ SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, con
 SolveResult one_step(const FlowEquation& equation, const at::Tensor& u, FlowOutput output,
                      const SolveOptions& options) {
   if (options.backward != Backward::kUnrolled) return flow_steps(equation, u, 1, output, options);
-  options.check("Flow");
+  check_flow_options(options);
   equation.check_steps(u, 1);
   return unrolled_step(equation, u, options, output);
 }
@@ -32,7 +32,7 @@ bool is_diffused_with_pressure(const FlowEquation& e) {
 
 SolveResult unrolled_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
                              const SolveOptions& options) {
-  options.check("Flow");
+  check_flow_options(options);
   equation.check_steps(u, steps);
   return solve_by_solve(u, steps, 1,
                         [&](const at::Tensor& state, int64_t) { return unrolled_step(equation, state, options); });

@@ -6,6 +6,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/for_each_cotangent.h"
+#include "prdp/error_text.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
@@ -140,13 +141,19 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
 
 }  // namespace
 
+void check_flow_options(const SolveOptions& options) {
+  options.check("Flow");
+  TORCH_CHECK_VALUE(options.start == Start::kZero, "Flow: start must be ", in_language("'zero'", "Start::kZero"),
+                    ": its solves are for changes");
+}
+
 at::Tensor output_of(const FlowStep& step, FlowOutput output, double dt) {
   return output == FlowOutput::kNext ? step.u : at::cat({step.u, step.potential / dt}, 1);
 }
 
 SolveResult flow_steps(const FlowEquation& equation, const at::Tensor& u, int64_t steps, FlowOutput output,
                        const SolveOptions& options) {
-  options.check("Flow");
+  check_flow_options(options);
   equation.check_steps(u, steps);
   const WithoutAutocast full_precision;
   bool differentiable = at::GradMode::is_enabled() && u.requires_grad();

@@ -6,6 +6,9 @@ namespace prdp {
 /// What steps of a flow return: the next state; the same with the pressure of the step as its last channel; all states.
 enum class FlowOutput { kNext, kNextAndPressure, kStates };
 
+/// Raises ValueError for options that no flow takes.
+void check_flow_options(const SolveOptions& options);
+
 /// The first or the second of them.
 at::Tensor output_of(const FlowStep& step, FlowOutput output, double dt);
 
