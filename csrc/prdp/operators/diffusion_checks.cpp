@@ -1,5 +1,4 @@
 #include <ATen/Dispatch.h>
-#include <ATen/EmptyTensor.h>
 #include <ATen/TensorSubclassLikeUtils.h>
 
 #include <algorithm>
@@ -8,27 +7,15 @@
 #include "prdp/error_text.h"
 #include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/plain_tensors.h"
-#include "prdp/operators/singular_operator.h"
 #include "prdp/operators/step_parameters.h"
 #include "prdp/operators/tensors.h"
 
-/// What a Diffusion is made of, what of it is refused, and what it warns of.
+/// What of a Diffusion is refused.
 namespace prdp {
 
 namespace {
 
-constexpr const char* kUnheld = "neither the shift nor a side holds u, so A is singular";
-
-/// `t` in this dtype; a number of the host without operations of torch, four of them, where autograd does not care.
-at::Tensor in_dtype(const at::Tensor& t, at::ScalarType dtype) {
-  if (t.scalar_type() == dtype) return t;
-  if (t.dim() > 0 || !t.is_cpu() || !t.has_storage() || !is_plain(t) || t.requires_grad() || has_tangent(t))
-    return t.to(dtype);
-  auto number = at::detail::empty_cpu({}, dtype);
-  if (dtype == at::kFloat) *number.mutable_data_ptr<float>() = static_cast<float>(number_of(t));
-  else *number.mutable_data_ptr<double>() = number_of(t);
-  return number;
-}
+constexpr const char* kNothingHolds = "neither the shift nor a side holds u, so A is singular";
 
 /// Which samples of a number or a field are zero throughout: (batch or 1).
 at::Tensor zero_samples(const at::Tensor& t) {
@@ -47,98 +34,12 @@ at::Tensor zero_samples(const at::Tensor& t) {
 
 }  // namespace
 
-OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const std::vector<Sides>& sides,
-                       const std::vector<double>& lengths, FaceMean faces, const std::vector<at::Tensor>& robin,
-                       bool per_axis) {
-  TORCH_CHECK_VALUE(kappa.defined() && shift.defined(), "Diffusion: ", kappa.defined() ? "shift" : "kappa",
-                    " is an undefined tensor");
-  const int64_t axes = kappa.dim() - 1 - static_cast<int64_t>(per_axis);
-  TORCH_CHECK_VALUE(axes >= 1 && axes <= 3, "Diffusion: kappa must have shape (batch or 1, ", per_axis ? "axes, " : "",
-                    "*shape) with 1 to 3 axes in shape, got ", kappa.sizes());
-  const auto dim = static_cast<size_t>(axes);
-  TORCH_CHECK_VALUE(sides.size() == 1 || sides.size() == dim, "Diffusion: boundary must be one for all axes or ", dim,
-                    ", one for each, got ", sides.size());
-  TORCH_CHECK_VALUE(lengths.size() == 1 || lengths.size() == dim, "Diffusion: length must be one number or ", dim,
-                    ", one for each axis, got ", lengths.size());
-  OperatorSpec spec{
-      per_axis ? "diffusion_per_axis" : "diffusion", kappa.sizes().slice(kappa.dim() - axes).vec(), {}, {kappa, shift}};
-  spec.tensors.insert(spec.tensors.end(), robin.begin(), robin.end());
-  for (size_t d = 0; d < dim; ++d) {
-    const auto& [low, high] = sides[sides.size() == 1 ? 0 : d];
-    spec.parameters.insert(spec.parameters.end(), {static_cast<double>(low), static_cast<double>(high)});
-  }
-  for (size_t d = 0; d < dim; ++d) spec.parameters.push_back(lengths[lengths.size() == 1 ? 0 : d]);
-  spec.parameters.push_back(static_cast<double>(faces));
-  [[maybe_unused]] const DiffusionOperator checks_the_rest(spec);
-  bool held = shift.dim() > 0 || shift.item<double>() != 0.0;
-  for (const auto& axis : sides)
-    for (const auto side : {axis.low, axis.high}) held = held || side == Side::kZero || side == Side::kRobin;
-  if (held) return spec;
-  return with_null_space(std::move(spec), at::empty({0}, kappa.options()));
-}
-
-DiffusionOperator::DiffusionOperator(const OperatorSpec& spec)
-    : shape_(spec.shape), per_axis_(spec.kind.ends_with("_per_axis")), names_null_space_(is_singular(spec)) {
-  TORCH_CHECK_VALUE(spec.tensors.size() >= 2, "Diffusion: takes the tensors kappa, shift, and h of each Robin side");
-  const auto &kappa = spec.tensors[0], &shift = spec.tensors[1];
-  auto of_sample = shape_;
-  if (per_axis_) of_sample.insert(of_sample.begin(), dim());
-  TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && kappa.dim() == 1 + static_cast<int64_t>(of_sample.size()) &&
-                        kappa.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(of_sample)),
-                    "Diffusion: kappa must have shape (batch or 1, ", per_axis_ ? "axes, " : "", "*shape), got ",
-                    kappa.sym_sizes());
-  TORCH_CHECK_VALUE(std::all_of(shape_.begin(), shape_.end(), [](int64_t n) { return n >= 1; }),
-                    "Diffusion: every extent of shape must be >= 1, got ", at::IntArrayRef(shape_));
-  TORCH_CHECK_TYPE(kappa.scalar_type() == at::kFloat || kappa.scalar_type() == at::kDouble,
-                   "Diffusion: kappa must be float32 or float64, got ", kappa.scalar_type());
-  TORCH_CHECK_VALUE(
-      shift.dim() == 0 || (shift.dim() == dim() + 1 &&
-                           shift.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_))),
-      "Diffusion: shift must be a number or (batch or 1, *shape), got ", shift.sym_sizes());
-  kappa_ = per_axis_ ? kappa : kappa.unsqueeze(1);
-  shift_ = in_dtype(shift, kappa.scalar_type());
-  if (shift.dim() > 0) shift_ = shift_.unsqueeze(1);
-  const auto axes = static_cast<size_t>(dim());
-  TORCH_CHECK_VALUE(spec.parameters.size() == 3 * axes + 1, "Diffusion: expected ", 3 * axes + 1, " parameters, got ",
-                    spec.parameters.size());
-  for (size_t d = 0; d < axes; ++d) {
-    sides_.push_back({static_cast<Side>(static_cast<int>(spec.parameters[2 * d])),
-                      static_cast<Side>(static_cast<int>(spec.parameters[2 * d + 1]))});
-    TORCH_CHECK_VALUE((sides_[d][0] == Side::kPeriodic) == (sides_[d][1] == Side::kPeriodic),
-                      "Diffusion: both sides of an axis are periodic or none is");
-    lengths_.push_back(spec.parameters[2 * axes + d]);
-    TORCH_CHECK_VALUE(std::isfinite(lengths_[d]) && lengths_[d] > 0.0, "Diffusion: length must be > 0, got ",
-                      lengths_[d]);
-  }
-  mean_ = static_cast<FaceMean>(static_cast<int>(spec.parameters.back()));
-  for (int64_t axis = 0; axis < dim(); ++axis)
-    for (size_t end = 0; end < 2; ++end)
-      if (sides_[axis][end] == Side::kRobin) take_robin(spec.tensors, axis, end);
-  TORCH_CHECK_VALUE(spec.tensors.size() == 2 + robin_.size(), "Diffusion: takes h of each Robin side, ", robin_.size(),
-                    " here, got ", spec.tensors.size() - 2);
-}
-
-void DiffusionOperator::take_robin(const std::vector<at::Tensor>& tensors, int64_t axis, size_t end) {
-  TORCH_CHECK_VALUE(2 + robin_.size() < tensors.size(), "Diffusion: takes h of each Robin side, got ",
-                    tensors.size() - 2);
-  const auto& h = tensors[2 + robin_.size()];
-  auto side = shape_;
-  side.erase(side.begin() + axis);
-  const auto whole = c10::fromIntArrayRefSlow(side);
-  TORCH_CHECK_VALUE(h.dim() == 0 || (h.dim() == dim() && h.sym_sizes().slice(1) == c10::SymIntArrayRef(whole)),
-                    "Diffusion: h of the ", end == 0 ? "low" : "high", " side of axis ", axis,
-                    " must be a number or have shape (batch or 1, *side), where side is ", at::IntArrayRef(side),
-                    ", got ", h.sym_sizes());
-  const auto taken = in_dtype(h, kappa_.scalar_type());
-  robin_.push_back(h.dim() == 0 ? taken : taken.unsqueeze(1 + axis).unsqueeze(1));
-}
-
 const at::Tensor& DiffusionOperator::robin(int64_t axis, size_t end) const {
   size_t before = 0;
   for (int64_t d = 0; d < dim(); ++d)
     for (size_t e = 0; e < 2; ++e) {
       if (d == axis && e == end) return robin_[before];
-      before += sides_[d][e] == Side::kRobin;
+      before += box_.sides[d][e] == Side::kRobin;
     }
   TORCH_INTERNAL_ASSERT(false);
 }
@@ -171,52 +72,65 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
                       t.device(), " but the vector is on ", b.device());
 }
 
-at::Tensor DiffusionOperator::unheld() const {
+at::Tensor DiffusionOperator::unheld_samples() const {
   if (names_null_space_ || known_held_) return {};
-  for (const auto& of_axis : sides_)
+  for (const auto& of_axis : box_.sides)
     if (of_axis[0] == Side::kZero || of_axis[1] == Side::kZero) return {};
-  auto holds = robin_;
-  holds.push_back(shift_);
-  for (const auto& t : holds)
+  auto may_hold = robin_;
+  may_hold.push_back(shift_);
+  for (const auto& t : may_hold)
     if (t.dim() == 0 && t.is_cpu() && is_plain(t) && number_of(t) != 0.0) return {};
-  at::Tensor lost;
-  for (const auto& t : holds) {
+  at::Tensor unheld;
+  for (const auto& t : may_hold) {
     const auto zero = zero_samples(t.detach()).to(kappa_.device());
-    lost = lost.defined() ? lost.logical_and(zero) : zero;
+    unheld = unheld.defined() ? unheld.logical_and(zero) : zero;
   }
-  known_held_ = lost.is_cpu() && is_plain(lost) && !lost.any().item<bool>();
-  return known_held_ ? at::Tensor() : lost;
+  known_held_ = unheld.is_cpu() && is_plain(unheld) && !unheld.any().item<bool>();
+  return known_held_ ? at::Tensor() : unheld;
 }
 
 at::Tensor DiffusionOperator::shift_or_nan() const {
-  const auto lost = unheld();
-  if (!lost.defined()) return shift_;
+  const auto unheld = unheld_samples();
+  if (!unheld.defined()) return shift_;
   std::vector<int64_t> of_samples(shape_.size() + 2, 1), field{-1, 1};
-  of_samples[0] = lost.size(0);
+  of_samples[0] = unheld.size(0);
   field.insert(field.end(), shape_.begin(), shape_.end());
-  const auto added = at::zeros(of_samples, kappa_.options()).masked_fill(lost.view(of_samples), NAN);
+  const auto added = at::zeros(of_samples, kappa_.options()).masked_fill(unheld.view(of_samples), NAN);
   return (shift_ + added).expand(field);
 }
 
 at::Tensor DiffusionOperator::nonfinite_samples(const at::Tensor& b) const {
-  const auto nonfinite = Operator::nonfinite_samples(b), lost = unheld();
-  return lost.defined() ? nonfinite.logical_or(lost) : nonfinite;
+  const auto nonfinite = Operator::nonfinite_samples(b), unheld = unheld_samples();
+  return unheld.defined() ? nonfinite.logical_or(unheld) : nonfinite;
 }
 
 void DiffusionOperator::check_parameters(Checks checks) const {
   for (const auto& [name, t] : tensors())
     if (at::isTensorSubclassLike(t) || t.is_meta() || t.numel() == 0) return;  // no numbers, or none yet
+  check_robin(checks);
+  if (checks == Checks::kHost) return;
+  if (checks == Checks::kAll) check_held();
+  check_kappa(checks);
+}
+
+void DiffusionOperator::check_robin(Checks checks) const {
   for (const auto& h : robin_) {
     if (checks != Checks::kAll && (h.dim() > 0 || (checks == Checks::kHost && !h.is_cpu()))) continue;
     const double least = h.min().item<double>();
     TORCH_CHECK_VALUE(!(least < 0.0) && (h.dim() > 0 || std::isfinite(least)),
                       "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
   }
-  if (checks == Checks::kHost) return;
-  if (const auto lost = checks == Checks::kAll ? unheld() : at::Tensor(); lost.defined() && lost.any().item<bool>())
-    TORCH_CHECK_VALUE(false, "Diffusion: in sample ", first_true(lost)[0], " ", kUnheld, "; if that is meant, give ",
-                      in_language("shift=0.0", "0.0 as shift"),
-                      ", a number, which makes the constant the null space of all samples");
+}
+
+void DiffusionOperator::check_held() const {
+  const auto unheld = unheld_samples();
+  if (!unheld.defined() || !unheld.any().item<bool>()) return;
+  TORCH_CHECK_VALUE(false, "Diffusion: in sample ", first_true(unheld)[0], " ", kNothingHolds,
+                    "; if that is meant, give ", in_language("shift=0.0", "0.0 as shift"),
+                    ", a number, which makes the constant the null space of all samples");
+}
+
+void DiffusionOperator::check_kappa(Checks checks) const {
   known_positive_ = kappa_.min().item<double>() > 0.0;
   if (known_positive_) return;
   const auto wrong = kappa_.le(0);
@@ -250,8 +164,8 @@ std::vector<int64_t> DiffusionOperator::first_nonfinite(int64_t sample) const {
 std::string DiffusionOperator::refusal(int64_t sample) const {
   const auto found = first_refused(sample);
   if (!found) {
-    const auto lost = unheld();
-    return lost.defined() && lost[lost.size(0) == 1 ? 0 : sample].item<bool>() ? kUnheld : "";
+    const auto unheld = unheld_samples();
+    return unheld.defined() && unheld[unheld.size(0) == 1 ? 0 : sample].item<bool>() ? kNothingHolds : "";
   }
   if (!std::isfinite(found->value)) return {};
   std::ostringstream text;

@@ -53,14 +53,14 @@ at::Tensor derivative_of_mean(FaceMean mean, const at::Tensor& a, const at::Tens
 }  // namespace
 
 double DiffusionOperator::inverse_width(int64_t axis) const {
-  return static_cast<double>(shape_[axis]) / lengths_[axis];
+  return static_cast<double>(shape_[axis]) / box_.lengths[axis];
 }
 double DiffusionOperator::inverse_width2(int64_t axis) const { return inverse_width(axis) * inverse_width(axis); }
 
 std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) const {
   const int64_t d = 2 + axis;
   const double scale = factor * inverse_width2(axis);
-  const bool harmonic = mean_ == FaceMean::kHarmonic;
+  const bool harmonic = box_.mean == FaceMean::kHarmonic;
   const auto kappa = kappa_along(axis);
   const auto averaged = harmonic ? kappa.reciprocal() : kappa;
   const auto mean = [&](const at::Tensor& a, const at::Tensor& b) {
@@ -69,8 +69,8 @@ std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) 
   const auto inner = mean(above(averaged, d), below(averaged, d));
   const auto outer = [&](size_t end) -> at::Tensor {
     const auto cells = end == 0 ? first(kappa, d) : last(kappa, d);
-    if (sides_[axis][end] == Side::kZero) return 2.0 * scale * cells;
-    if (sides_[axis][end] != Side::kRobin) return at::zeros_like(cells);
+    if (box_.sides[axis][end] == Side::kZero) return 2.0 * scale * cells;
+    if (box_.sides[axis][end] != Side::kRobin) return at::zeros_like(cells);
     const auto& h = robin(axis, end);
     const auto within = 2.0 * inverse_width2(axis) * cells,
                beyond = inverse_width(axis) * (h.dim() == 0 ? h : or_nan(h, h.ge(0)));
@@ -99,7 +99,7 @@ DiffusionOperator::SideProducts DiffusionOperator::side_product_rule(int64_t axi
                                                                      const at::Tensor& u) const {
   const int64_t d = 2 + axis;
   const auto at_side = [&](const at::Tensor& t) { return end == 0 ? first(t, d) : last(t, d); };
-  const auto side = sides_[axis][end];
+  const auto side = box_.sides[axis][end];
   if (side != Side::kZero && side != Side::kRobin) return {};
   const auto product = inverse_width2(axis) * over_channels(at_side(u), at_side(lambda));
   if (side == Side::kZero) return {2.0 * product, {}};
@@ -125,13 +125,13 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
     const auto at_last = [&](const at::Tensor& t) { return padded(t, d, shape_[axis] - t.size(d), 0); };
     const auto inner =
         inverse_width2(axis) * over_channels(above(u, d) - below(u, d), above(lambda, d) - below(lambda, d));
-    add_to(kappa_bar, at_last(inner * derivative_of_mean(mean_, above(kappa, d), below(kappa, d))));
-    add_to(kappa_bar, at_first(inner * derivative_of_mean(mean_, below(kappa, d), above(kappa, d))));
+    add_to(kappa_bar, at_last(inner * derivative_of_mean(box_.mean, above(kappa, d), below(kappa, d))));
+    add_to(kappa_bar, at_first(inner * derivative_of_mean(box_.mean, below(kappa, d), above(kappa, d))));
     if (wraps_around(axis)) {
       const auto around =
           inverse_width2(axis) * over_channels(first(u, d) - last(u, d), first(lambda, d) - last(lambda, d));
-      add_to(kappa_bar, at_first(around * derivative_of_mean(mean_, first(kappa, d), last(kappa, d))));
-      add_to(kappa_bar, at_last(around * derivative_of_mean(mean_, last(kappa, d), first(kappa, d))));
+      add_to(kappa_bar, at_first(around * derivative_of_mean(box_.mean, first(kappa, d), last(kappa, d))));
+      add_to(kappa_bar, at_last(around * derivative_of_mean(box_.mean, last(kappa, d), first(kappa, d))));
     }
     for (size_t end = 0; end < 2; ++end) {
       const auto [of_kappa, of_h] = side_product_rule(axis, end, lambda, u);
@@ -218,7 +218,7 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
   for (size_t axis = 0; axis < 3; ++axis) {
     const int64_t d = static_cast<int64_t>(axis) - 3 + dim();
     for (size_t end = 0; end < 2; ++end) {
-      const auto side = d < 0 ? Side::kFlux : sides_[d][end];
+      const auto side = d < 0 ? Side::kFlux : box_.sides[d][end];
       sides += ", " + std::to_string(static_cast<int>(side));
       auto on_side = field;
       if (d >= 0) on_side[2 + d] = 1;
@@ -227,7 +227,7 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
     view.numbers[kInverseWidth + axis] = d < 0 ? 0.0 : inverse_width(d);
   }
   view.type = "Diffusion<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(shape_) + ", " +
-              std::to_string(b.size(1)) + ", " + std::to_string(mean_ == FaceMean::kHarmonic) + ", " +
+              std::to_string(b.size(1)) + ", " + std::to_string(box_.mean == FaceMean::kHarmonic) + ", " +
               std::to_string(kappa_.size(1)) + sides + ">";
   return view;
 }
@@ -235,10 +235,10 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
 std::optional<kernels::FactorKey> DiffusionOperator::key(bool /*transposed*/) const {
   kernels::FactorKeyMaker key;
   key.add(int64_t{per_axis_ ? -2 : -1})
-      .add(static_cast<int64_t>(mean_))
+      .add(static_cast<int64_t>(box_.mean))
       .add(shape_.data(), dim())
-      .add(lengths_.data(), dim());
-  for (const auto& sides : sides_)
+      .add(box_.lengths.data(), dim());
+  for (const auto& sides : box_.sides)
     for (const auto side : sides) key.add(static_cast<int64_t>(side));
   for (const auto& [name, t] : tensors()) {
     if (t.dim() > 0 && t.size(0) != 1) return std::nullopt;

@@ -42,10 +42,21 @@ inline OperatorSpec diffusion(const at::Tensor& kappa, double shift = 0.0,
   return diffusion(kappa, at::full({}, shift, options), sides, lengths, faces, robin, per_axis);
 }
 
-/// The operator of kind "diffusion", or "diffusion_per_axis". Parameters: the two sides of each axis, the lengths, the
-/// mean on faces. Tensors: kappa, shift, and h of each Robin side.
+/// The operator of kind "diffusion", or "diffusion_per_axis". Parameters: its Box. Tensors: kappa, shift, and h of each
+/// Robin side.
 class DiffusionOperator final : public Operator {
  public:
+  /// What is known of it without a tensor, packed in this order as the parameters of its OperatorSpec.
+  struct Box {
+    std::vector<std::array<Side, 2>> sides;  // of each axis
+    std::vector<double> lengths;
+    FaceMean mean = FaceMean::kHarmonic;
+
+    std::vector<double> packed() const;
+    static Box unpacked(const std::vector<double>& numbers, size_t axes);
+    void check() const;
+  };
+
   explicit DiffusionOperator(const OperatorSpec& spec);
 
   void check_vector(const at::Tensor& b) const override;
@@ -83,7 +94,7 @@ class DiffusionOperator final : public Operator {
   std::vector<at::Tensor> launch_product_rule(const at::Tensor& lambda, const at::Tensor& u) const;
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   /// Whether the first and the last cell of an axis are neighbours; a single cell is none of itself.
-  bool wraps_around(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic && shape_[axis] > 1; }
+  bool wraps_around(int64_t axis) const { return box_.sides[axis][0] == Side::kPeriodic && shape_[axis] > 1; }
   /// Whether the loops make products of differences: in float32, the rounding of a diagonal would change what is slow
   /// to change, the mean of u first, in every solve.
   bool takes_differences() const { return kappa_.scalar_type() == at::kFloat; }
@@ -99,9 +110,13 @@ class DiffusionOperator final : public Operator {
   std::optional<Refused> first_refused(int64_t sample) const;
   /// Samples whose shift and h of every Robin side are zero, while no other side holds u: a tensor (batch or 1). There
   /// A is singular, and as others hold u, no null space is named. Undefined where that cannot be.
-  at::Tensor unheld() const;
+  at::Tensor unheld_samples() const;
   /// The shift, with NaN in these samples, which then are refused.
   at::Tensor shift_or_nan() const;
+  void check_robin(Checks checks) const;
+  void check_held() const;
+  void check_kappa(Checks checks) const;
+  void check_shapes(const std::vector<at::Tensor>& tensors) const;
   void take_robin(const std::vector<at::Tensor>& tensors, int64_t axis, size_t end);
   const at::Tensor& robin(int64_t axis, size_t end) const;
   std::vector<std::pair<const char*, at::Tensor>> tensors() const;
@@ -112,9 +127,7 @@ class DiffusionOperator final : public Operator {
   at::Tensor coefficients() const;
 
   std::vector<int64_t> shape_;
-  std::vector<std::array<Side, 2>> sides_;
-  std::vector<double> lengths_;
-  FaceMean mean_;
+  Box box_;
   bool per_axis_, names_null_space_;
   mutable bool known_positive_ = false, known_held_ = false;  // once somebody has looked, so that nobody looks again
   // With an axis of one channel, or of those of κ, and one of extent 1 where a side has none; or 0-dimensional.

@@ -35,7 +35,7 @@ std::vector<at::Tensor> DiffusionOperator::launch_product_rule(const at::Tensor&
   rule.pair = pair_of<T>(l, v, kappa.size(0));
   rule.batch = static_cast<int>(l.size(0));
   rule.kappas = static_cast<int>(kappa.size(1));
-  rule.harmonic = mean_ == FaceMean::kHarmonic;
+  rule.harmonic = box_.mean == FaceMean::kHarmonic;
   rule.kappa = kappa.const_data_ptr<T>();
   rule.kappa_out = kappa_bar.mutable_data_ptr<T>();
   for (int64_t axis = 0; axis < 3; ++axis) {
@@ -43,7 +43,7 @@ std::vector<at::Tensor> DiffusionOperator::launch_product_rule(const at::Tensor&
     rule.n[axis] = d < 0 ? 1 : static_cast<int>(shape_[d]);
     rule.inverse_width[axis] = d < 0 ? 0.0 : inverse_width(d);
     for (int64_t end = 0; end < 2; ++end)
-      rule.sides[2 * axis + end] = static_cast<int>(d < 0 ? Side::kFlux : sides_[d][end]);
+      rule.sides[2 * axis + end] = static_cast<int>(d < 0 ? Side::kFlux : box_.sides[d][end]);
   }
   BroadcastSums sums(l);
   const size_t shift_sum = sums.size();
@@ -51,7 +51,7 @@ std::vector<at::Tensor> DiffusionOperator::launch_product_rule(const at::Tensor&
   std::vector<RobinSide> robin_sides;
   for (int64_t axis = 0; axis < dim(); ++axis)
     for (size_t end = 0; end < 2; ++end) {
-      if (sides_[axis][end] != Side::kRobin) continue;
+      if (box_.sides[axis][end] != Side::kRobin) continue;
       const int64_t number = 2 * axis_of_kernel(axis, dim()) + static_cast<int64_t>(end);
       robin_sides.push_back({axis, number, sums.size(), robin(axis, end).detach().contiguous()});
       rule.robin[number] = side_field<T>(robin_sides.back().h);

@@ -1,16 +1,16 @@
 #pragma once
 #include <string>
 
-#include "prdp/solvers/failure_messages.h"
+#include "prdp/solvers/failed_sample.h"
 
 /// What the messages of failed solves say of null spaces.
 namespace prdp {
 
 /// Where A maps the constant to zero, though nobody named its null space: that, in words. Else empty. Operators of the
 /// library know their own.
-std::string undeclared_null_space(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample);
+std::string undeclared_null_space(const FailedSample& sample);
 
 /// What of b A cannot reach, and what to do.
-std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample);
+std::string inconsistent(const FailedSample& sample);
 
 }  // namespace prdp

@@ -79,7 +79,7 @@ bool warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tens
     text << name_of(role) << ": " << many << " of " << b.size(0)
          << " samples STAGNATED far above rtol = " << role.solver.rtol << ": sample " << worst
          << " at relative residual " << residual[worst] << " after " << info.iterations[worst].item<int64_t>()
-         << " iterations, " << diagnosis(role, a, b, SolveStatus::kStagnated, worst);
+         << " iterations, " << diagnosis({role, a, b, worst}, SolveStatus::kStagnated);
   });
   return true;
 }
@@ -123,7 +123,7 @@ bool warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& 
     text << name_of(role) << ": " << grown.size() << " of " << b.size(0)
          << " samples stopped at max_iter = " << role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
          << " at " << residual[worst] << ", where rtol = " << role.solver.rtol << " was asked for, "
-         << diagnosis(role, a, b, SolveStatus::kMaxIter, worst) << "; or rtol=0 if this is meant";
+         << diagnosis({role, a, b, worst}, SolveStatus::kMaxIter) << "; or rtol=0 if this is meant";
   });
   return true;
 }
@@ -149,12 +149,12 @@ void warn_of_unfit(const SolveRole& role, const Operator& a, const at::Tensor& b
   const int64_t worst = worst_of(unsolved, residual);
   const double bound = 10.0 * std::max(s.rtol, floor[worst]);
   if (static_cast<double>(products[worst]) < many || !(residual[worst] > bound)) return;
-  if (unfit(role, a, b, worst).empty()) return;
+  if (unfit({role, a, b, worst}).empty()) return;
   warn_once("unfit: " + key_of(role), residual[worst], [&](std::ostream& text) {
     text << name_of(role) << ": " << unsolved.size() << " of " << b.size(0)
          << " samples did not reach rtol = " << s.rtol << ": sample " << worst << " is at relative residual "
          << residual[worst] << " after " << products[worst] << " products with A, "
-         << diagnosis(role, a, b, SolveStatus::kMaxIter, worst);
+         << diagnosis({role, a, b, worst}, SolveStatus::kMaxIter);
   });
 }
 
@@ -178,7 +178,7 @@ bool warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor&
                        : role.x0.defined()   ? "its start"
                                              : "zero")
                    << " at relative residual " << residual[first] << ", as the last of " << role.solver.max_iter
-                   << " iterates was worse, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first);
+                   << " iterates was worse, " << diagnosis({role, a, b, first}, SolveStatus::kMaxIter);
             });
   return true;
 }
@@ -222,7 +222,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
     if (!is_refused(what))
       text << " (the iterate handed out has relative residual " << info.residual[i].item<double>() << " after "
            << info.iterations[i].item<int64_t>() << " iterations)";
-    const auto why = diagnosis(role, a, b, what, i);
+    const auto why = diagnosis({role, a, b, i}, what);
     if (why != said) text << ", " << why;
     said = why;
   }

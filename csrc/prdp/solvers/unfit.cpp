@@ -19,8 +19,6 @@ namespace {
 /// One sample of a batch of vectors.
 at::Tensor row(const at::Tensor& v, int64_t sample) { return v.select(0, sample).flatten().to(at::kDouble); }
 
-double norm_of(const at::Tensor& v) { return v.norm().item<double>(); }
-
 /// How far A is from symmetric, for vectors without structure of this sample: ‖A v - Aᵀ v‖ / ‖A v‖, and, as the
 /// transpose of a function may be claimed to be A itself, |⟨A v, w⟩ - ⟨v, A w⟩| / (‖A v‖ ‖w‖). NaN for a function
 /// without a transpose.
@@ -51,25 +49,26 @@ bool needs_symmetry(Method method) {
 
 }  // namespace
 
-std::string asymmetric(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  const double share = asymmetry(a, b, sample);
-  if (!(share > (is_function(role.a) ? rounding_of_differences(b) : 100.0 * epsilon_of(b)))) return {};
+std::string asymmetric(const FailedSample& sample) {
+  const double share = asymmetry(sample.a, sample.b, sample.index);
+  const double rounding = is_function(sample.role.a) ? rounding_of_differences(sample.b) : 100.0 * epsilon_of(sample.b);
+  if (!(share > rounding)) return {};
   return "A is not symmetric (‖A v - Aᵀ v‖ is " + three_digits(share) + " ‖A v‖ for a v of no structure); take GMRES";
 }
 
-std::string unfit(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+std::string unfit(const FailedSample& sample) {
   const at::NoGradGuard no_grad;
-  const auto& solver = role.solver;
-  const bool symmetric = needs_symmetry(solver.method);
+  const bool symmetric = needs_symmetry(sample.solver().method);
   if (symmetric)
-    if (auto found = asymmetric(role, a, b, sample); !found.empty()) return found;
-  if (!solver.preconditioner.is_operator()) return {};
-  const auto m = make_operator(solver.preconditioner.spec());
-  if (nonlinearity(*m, b, sample) > rounding_of_differences(b))
+    if (auto found = asymmetric(sample); !found.empty()) return found;
+  if (!sample.preconditioner().is_operator()) return {};
+  const auto m = make_operator(sample.preconditioner().spec());
+  const double rounding = rounding_of_differences(sample.b);
+  if (nonlinearity(*m, sample.b, sample.index) > rounding)
     return "its preconditioner is not linear: M⁻¹(-2 v) is not -2 M⁻¹ v; a network is linear without biases and "
            "activations";
-  const double share = symmetric ? asymmetry(*m, b, sample) : 0.0;
-  if (!(share > rounding_of_differences(b))) return {};
+  const double share = symmetric ? asymmetry(*m, sample.b, sample.index) : 0.0;
+  if (!(share > rounding)) return {};
   return "its preconditioner is not symmetric (‖M⁻¹v - M⁻ᵀv‖ is " + three_digits(share) +
          " ‖M⁻¹v‖ for a v of no structure); take GMRES";
 }

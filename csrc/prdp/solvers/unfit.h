@@ -1,16 +1,16 @@
 #pragma once
 #include <string>
 
-#include "prdp/solvers/report_failures.h"
+#include "prdp/solvers/failed_sample.h"
 
 /// Whether A and a preconditioner of one's own are what a method is made for, as a few products tell.
 namespace prdp {
 
 /// Where A is not symmetric: that, in words. Else empty.
-std::string asymmetric(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample);
+std::string asymmetric(const FailedSample& sample);
 
 /// Where the method needs A, or a preconditioner of one's own, to be symmetric, or the latter to be linear, and it is
 /// not: that, in words. Else empty.
-std::string unfit(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample);
+std::string unfit(const FailedSample& sample);
 
 }  // namespace prdp
