@@ -50,7 +50,7 @@ kernels: $(STAMPS)/configure
 bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
-	.venv-peers/bin/python -m prdp_torch bench
+	.venv-peers/bin/python -m benchmarks
 
 records: $(STAMPS)/configure
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python
@@ -83,7 +83,7 @@ cuda:
 	$(CUDA_CMAKE) --install build-cuda --component python --prefix prdp_torch > build-cuda/install.log
 	PRDP_BUILD_DIR=build-cuda $(CUDA)/python -m pytest -m cuda tests/python/test_cuda.py tests/python/test_cuda_streams.py tests/python/test_cuda_trainings.py
 	$(if $(filter cpu,$(DEVICE)),,@$(MAKE) --no-print-directory sanitize-cuda)
-	$(CUDA)/python -m benchmarks.devices --device $(DEVICE) --chart build-cuda/devices.png $(if $(filter cpu,$(DEVICE)),--quick) | tee build-cuda/devices.jsonl
+	$(CUDA)/python -m benchmarks.devices --device $(DEVICE) --out build-cuda $(if $(filter cpu,$(DEVICE)),--quick)
 	$(CUDA)/python -m benchmarks.updates --device $(DEVICE) $(if $(filter cpu,$(DEVICE)),--quick) | tee build-cuda/updates.jsonl
 
 # A short test under each tool of compute-sanitizer, where CUDA's toolkit has it. Memory is torch's alone without its cache,

@@ -1,1 +1,1 @@
-"""Benchmarks: cost beside accuracy, ours and others', on the same systems. `prdp bench` runs them."""
+"""Benchmarks: cost beside accuracy, ours and others', on the same systems. `python -m benchmarks` runs them."""

@@ -1,4 +1,4 @@
-"""Runs the suites on one thread; `prdp bench` calls this in a process of its own."""
+"""The suites, on one thread: `python -m benchmarks accuracy`."""
 
 import argparse
 import importlib
@@ -28,15 +28,14 @@ def peer_versions():
 
 
 def main():
-    parser = argparse.ArgumentParser(prog="prdp bench")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("suites", nargs="*", metavar="SUITE", help=f"{', '.join(SUITES)}; all.")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for the results")
+    parser.add_argument("--quick", action="store_true", help="few budgets and rounds, to see that all of it runs")
     options = parser.parse_args()
     for suite in options.suites:
         if suite not in SUITES:
-            print(f"bench: unknown suite '{suite}'; allowed: {', '.join(SUITES)}", file=sys.stderr)
-            sys.exit(2)
+            parser.error(f"unknown suite '{suite}'; allowed: {', '.join(SUITES)}")
     use_one_thread()
     import torch  # only now: it reads the environment, and counts the cores for its pool
 
@@ -47,7 +46,6 @@ def main():
     measure.keep_to_one_core()
     folder = records.prepare_folder(options.out)
     environment = records.environment() | {"peers": peer_versions()}
-    environment["command"] = " ".join(["prdp", "bench", *options.suites, *(["--quick"] if options.quick else [])])
     results = {}
     for suite in options.suites or SUITES:
         module = importlib.import_module(f"benchmarks.{suite}")

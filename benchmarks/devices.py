@@ -2,7 +2,8 @@
 `python -m benchmarks.devices --device cuda`.
 
 The problems are those of the suites, larger grids, and flows. A call is a solve of K iterations, or a rollout, with its
-gradient, and ends when the device has. One JSON record a line: the time that passes, and the errors.
+gradient, and ends when the device has. It prints a JSON record a line, the time that passes and the errors, and writes
+them and their chart to a folder.
 """
 
 import argparse
@@ -16,9 +17,12 @@ from pathlib import Path
 import torch
 
 import prdp_torch as prdp
-from benchmarks import problems
+from benchmarks import charts, problems
 from benchmarks.peers import stencils, torch_eager
 from prdp_torch import operators
+from prdp_torch.experiments import _C
+from prdp_torch.experiments import records as files
+from prdp_torch.experiments.charts import write_png
 
 CURVES = " raise", "eager torch loop", "JAX jit"  # the ways that are timed for several K
 LARGEST_FACTORED = 100_000  # unknowns of a sample, up to which the gradient is compared with that of a direct solve
@@ -198,22 +202,24 @@ def run(device, quick=False):
 
 def main():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.devices")
-    parser.add_argument("--device", type=torch.device, default=torch.device("cuda"))
+    parser.add_argument("--device", default="cuda", help="cpu, cuda or cuda:N")
+    parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for devices.json and devices.png")
     parser.add_argument("--quick", action="store_true", help="small problems, to see that all of it runs")
-    parser.add_argument("--chart", type=Path, help="where to draw the errors over the time")
     options = parser.parse_args()
-    of = torch.cuda.get_device_name(options.device) if options.device.type == "cuda" else "the CPU's plain loops"
-    print(json.dumps({"device": str(options.device), "name": of, "torch": torch.__version__}), flush=True)
-    records = []
-    for record in run(options.device, options.quick):
+    try:
+        device = _C.find_device(options.device)
+    except ValueError as error:
+        parser.error(str(error))
+    folder = files.prepare_folder(options.out)
+    environment = files.environment(device) | {"quick": options.quick}
+    print(json.dumps(environment["machine"] | environment["versions"]), flush=True)
+    found = []
+    for record in run(device, options.quick):
         print(json.dumps(record), flush=True)
-        records.append(record)
-    if options.chart:
-        from benchmarks import charts
-        from prdp_torch.experiments.charts import write_png
-
-        curves = [r for r in records if r["way"].endswith(CURVES) and "k" in r]
-        write_png(charts.devices(curves), options.chart, dpi=110)
+        found.append(record)
+    files.write(folder / "devices.json", {**environment, "devices": found})
+    curves = [r for r in found if r["way"].endswith(CURVES) and "k" in r]
+    write_png(charts.devices(curves), folder / "devices.png", dpi=110)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def study(name, options, minutes):
 
 
 def suite(name, minutes):
-    return Made(name, f"-m prdp_torch bench {name}", minutes, f"{name}.json", f"performance/{name}.json")
+    return Made(name, f"-m benchmarks {name}", minutes, f"{name}.json", f"performance/{name}.json")
 
 
 LIST = [
@@ -99,7 +99,7 @@ LIST = [
         Made(f"mosaic_{task}", f"-m benchmarks.mosaic {task} --limit 150", 60, f"{task}.json", f"flows/{task}.json")
         for task in ("forward", "cost", "gradient", "horizon", "design", "recovery", "conduction")
     ),
-    Made("atlas", "-m prdp_torch stability", 1, "*", "stability"),
+    Made("atlas", "-m benchmarks.atlas", 1, "*", "stability"),
 ]
 
 

@@ -22,8 +22,8 @@ from docs.record_rows import seconds as seconds_of
 SCENES = ("poisson_1p", "poisson_3p", "poisson_3p_sd", "heat_1d", "heat_2d", "burgers_1d", "burgers_2d")
 SCENES = (*SCENES, "navier_stokes", "diffusion_inverse")
 TOO_SHORT = 0.5  # seconds of a training; what is shorter is all noise
-# The scene's solver, and what takes the time of an update, as `prdp bench training` measured it. diffusion_inverse has
-# no network.
+# The scene's solver, and what takes the time of an update, as `python -m benchmarks training` measured it.
+# diffusion_inverse has no network.
 GROUPS = {
     "solves": "the solves take the time",
     "both": "solves and network take it",

@@ -1,4 +1,5 @@
-"""The failure atlas: maps of where methods work and where they break, measured and drawn by `prdp stability`.
+"""The failure atlas: maps of where methods work and where they break, measured and drawn by
+`python -m benchmarks.atlas`.
 
 `problems` makes operators and right-hand sides; `solves`, `coarse_grids` and `gradients` measure maps; `pictures` draws
 them.

@@ -124,10 +124,8 @@ def run(folder, names=(), quick=False, show=lambda name, answer, seconds: None):
     """
     for name in names:
         if name not in MAPS:
-            raise ValueError(f"stability: unknown map '{name}'; allowed: {', '.join(MAPS)}")
+            raise ValueError(f"atlas: unknown map '{name}'; allowed: {', '.join(MAPS)}")
     threads, environment = torch.get_num_threads(), records.environment()
-    options = [*(f"--only {name}" for name in names), *(["--quick"] if quick else [])]
-    environment["command"] = " ".join(["prdp", "stability", *options])
     torch.set_num_threads(1)
     try:
         for name in names or MAPS:

@@ -1,13 +1,10 @@
-"""The command `prdp`: scenes, trainings, comparisons, advice, data and benchmarks."""
+"""The command `prdp`: scenes, trainings, comparisons, advice and data."""
 
 import contextlib
 import functools
-import importlib
-import json
-import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Annotated, Any, cast
 
@@ -225,74 +222,6 @@ def advise(
     with console.status("trying the solvers"):
         advised = scene_advice.advise_scene(loaded, seconds)
     console.print(str(advised), soft_wrap=True, highlight=False, markup=False)
-
-
-@command
-def bench(
-    suites: Annotated[
-        list[str] | None, typer.Argument(metavar="[SUITE]...", help="As `python -m benchmarks -h` lists them; all.")
-    ] = None,
-    out: Annotated[Path | None, _folder("runs/bench")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Few budgets and rounds, to see that all of it runs.")] = False,
-    device: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Time solves and flows there instead, beside torch and JAX.")
-    ] = None,
-) -> None:
-    """Time the solvers beside their errors, on one thread, with the other libraries that are installed."""
-    project = _project("bench")
-    if device is not None:
-        return _bench_device(project, device, suites or (), out, quick)
-    folder = (out or Path("runs") / "bench").resolve()
-    arguments = [*(suites or ()), "--out", folder, *(["--quick"] if quick else [])]
-    done = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], cwd=project)
-    if done.returncode:
-        raise typer.Exit(done.returncode)
-
-
-def _bench_device(project: Path, device: str, suites: Sequence[str], out: Path | None, quick: bool) -> None:
-    if suites:
-        raise ValueError(f"bench: the suites time the CPU; with --device give none, got {', '.join(suites)}")
-    environment = records.environment(_C.find_device(device))
-    path = records.prepare_folder(out or Path("runs") / "bench").resolve() / "devices.json"
-    arguments = ["--device", device, "--chart", str(path.with_suffix(".png")), *(["--quick"] if quick else [])]
-    found = []
-    run = [sys.executable, "-m", "benchmarks.devices", *arguments]
-    with subprocess.Popen(run, cwd=project, stdout=subprocess.PIPE, text=True) as running:
-        for line in cast(IO[str], running.stdout):
-            print(line, end="", flush=True)
-            found.append(json.loads(line))
-    if running.returncode:
-        raise typer.Exit(running.returncode)
-    records.write(path, {**environment, "quick": quick, "devices": found})
-    console.print(f"record: {path}", soft_wrap=True)
-
-
-@command
-def stability(
-    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="A map; give it again for more. All.")] = None,
-    out: Annotated[Path | None, _folder("runs/stability")] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="A few points of each map, to see that all of it runs.")
-    ] = False,
-) -> None:
-    """Map where the methods work and where they break: a picture and a record for each question."""
-    sys.path.insert(0, str(_project("stability")))
-    atlas = importlib.import_module("benchmarks.atlas")
-    folder = records.prepare_folder(out or Path("runs") / "stability")
-
-    def show(name: str, answer: str, seconds: float) -> None:
-        console.print(f"{name}: {atlas.MAPS[name].question} {answer} ({seconds:.0f} s)", soft_wrap=True)
-
-    atlas.run(folder, only or (), quick, show)
-    console.print(f"pictures and records: {folder}", soft_wrap=True)
-
-
-def _project(who: str) -> Path:
-    """The folder of the clone that this package lies in."""
-    project = Path(__file__).resolve().parents[2]
-    if not (project / "benchmarks").is_dir():
-        raise ValueError(f"{who}: the benchmarks are in the project's folder, not in the installed package; clone it")
-    return project
 
 
 def _load(scene: str, device: str | None, backward: str | None = None, intervals: int | None = None) -> _C.Scene:

@@ -123,7 +123,7 @@ def test_readings_are_taken_in_turn():
 def test_all_suites_run_and_leave_a_page(tmp_path):
     suites = ("roofline", "training", "memory", "large")
     done = subprocess.run(
-        [sys.executable, "-m", "prdp_torch", "bench", *suites, "--quick", "--out", tmp_path],
+        [sys.executable, "-m", "benchmarks", *suites, "--quick", "--out", tmp_path],
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -146,9 +146,27 @@ def test_an_update_of_a_scene_is_timed_with_its_solves_and_without():
 
 
 def test_an_unknown_suite_is_refused():
-    done = subprocess.run([sys.executable, "-m", "prdp_torch", "bench", "speed"], cwd=ROOT, capture_output=True,
+    done = subprocess.run([sys.executable, "-m", "benchmarks", "speed"], cwd=ROOT, capture_output=True,
                           text=True)  # fmt: skip
-    assert done.returncode == 2 and "bench: unknown suite 'speed'; allowed: accuracy, " in done.stderr
+    assert done.returncode == 2 and "unknown suite 'speed'; allowed: accuracy, " in done.stderr
+
+
+def test_a_device_is_timed_beside_the_errors(tmp_path):
+    command = [sys.executable, "-m", "benchmarks.devices", "--quick", "--out", tmp_path, "--device"]
+    done = subprocess.run([*command, "cpu"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    record = json.loads((tmp_path / "devices.json").read_text())
+    assert record["machine"]["device"] == "cpu" and record["versions"]["torch"] == torch.__version__
+    rows = record["devices"]
+    assert [json.loads(line) for line in done.stdout.splitlines()[1:]] == rows
+    solves = [row for row in rows if "residual" in row]
+    flows = [row for row in rows if row["problem"].startswith("Flow")]
+    assert (tmp_path / "devices.png").stat().st_size > 10_000
+    assert len(solves) > 10 and len(flows) >= 2 and len(solves) + len(flows) == len(rows)
+    assert all(row["seconds"] > 0 for row in rows) and all(row["residual"] < 1 for row in solves)
+    assert all(row["error"] < 1e-3 and row["gradient_error"] < 1e-3 for row in flows)
+    wrong = subprocess.run([*command, "moon"], cwd=ROOT, capture_output=True, text=True)
+    assert wrong.returncode == 2 and "device: unknown name 'moon'; allowed: cpu, cuda, cuda:N" in wrong.stderr
 
 
 CORES_OF_TWO_THREADS = """

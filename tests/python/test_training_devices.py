@@ -232,7 +232,7 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_a_device_that_is_not_there_is_one_sentence_before_any_work(name, tmp_path):
     words = rf"device: {WRONG[name]}"
-    for command in (["train", "heat_1d"], ["compare", "heat_1d"], ["advise", "heat_1d"], ["bench"]):
+    for command in (["train", "heat_1d"], ["compare", "heat_1d"], ["advise", "heat_1d"]):
         out = [] if command[0] == "advise" else ["--out", str(tmp_path / "out")]
         done = CliRunner().invoke(cli.app, [*command, "--device", name, *out])
         assert done.exit_code == 2 and re.fullmatch(f"prdp: {words}\n", done.stderr), done.stderr
@@ -261,20 +261,3 @@ def test_the_device_of_a_scene_is_looked_for_by_all_that_compute(tmp_path):
         subprocess.run([TRAINER, path, "--device", "cpu", "--intervals", "1", "--out", tmp_path / "out"]).returncode
         == 0
     )
-
-
-def test_bench_times_a_device(tmp_path):
-    command = ["bench", "--device", "cpu", "--quick", "--out", str(tmp_path)]
-    done = CliRunner().invoke(cli.app, command)
-    assert done.exit_code == 0, done.stderr
-    record = json.loads((tmp_path / "devices.json").read_text())
-    first, *rows = record["devices"]
-    assert first["device"] == record["machine"]["device"] == "cpu" and first["torch"] == torch.__version__
-    solves = [row for row in rows if "residual" in row]
-    flows = [row for row in rows if row["problem"].startswith("Flow")]
-    assert (tmp_path / "devices.png").stat().st_size > 10_000
-    assert len(solves) > 10 and len(flows) >= 2 and len(solves) + len(flows) == len(rows)
-    assert all(row["seconds"] > 0 for row in rows) and all(row["residual"] < 1 for row in solves)
-    assert all(row["error"] < 1e-3 and row["gradient_error"] < 1e-3 for row in flows)
-    named = CliRunner().invoke(cli.app, [*command, "accuracy"])
-    assert "bench: the suites time the CPU; with --device give none, got accuracy" in named.stderr
