@@ -40,6 +40,7 @@ class Operator:
         who = type(self).__name__
         self.shape = shape
         self.parameters = parameters
+        self._given = tuple(given)
         self.names = [name if isinstance(t, Tensor) else None for name, t in given.items()]
         self.tensors = [real_tensor(who, name, t) for name, t in given.items()]
         if null_spaces:
@@ -60,8 +61,15 @@ class Operator:
             super().__setattr__(name, value)
 
     def __repr__(self) -> str:
-        tensors = ", ".join(f"{t:.4g}" if t.dim() == 0 else f"tensor{tuple(t.shape)}" for t in self.tensors)
-        return f"{type(self).__name__}(shape={tuple(self.shape)}, parameters={self.parameters}, tensors=[{tensors}])"
+        of = {name: shown(t) for name, t in zip(self._given, self.tensors, strict=False)}
+        of |= {name: str(value) for name, value in self._settings().items()}
+        if self.kind.startswith("singular_"):
+            of["nullspace"] = shown(self.tensors[-2])
+        return f"{type(self).__name__}(shape={tuple(self.shape)}{''.join(f', {k}={v}' for k, v in of.items())})"
+
+    def _settings(self) -> dict[str, object]:
+        """What `parameters` say, by the names of their arguments."""
+        return {}
 
     def of(self, tensors: Iterable[Tensor]) -> Self:
         """The same operator, made of other tensors."""
@@ -117,6 +125,13 @@ class Operator:
                 f"{type(self).__name__}: dense() of {n} unknowns would take {needed / 1e9:.3g} GB, and this machine "
                 f"has {there / 1e9:.3g} GB; apply() needs no matrix"
             )
+
+
+def shown(t: Tensor) -> str:
+    """A tensor in a repr: a number as it is, "constant" for the basis that stands for it, and the shape of others."""
+    if t.dim() == 0:
+        return f"{t:.4g}"
+    return f"tensor{tuple(t.shape)}" if t.numel() > 0 else "'constant'"
 
 
 def _refuse_freed(what: str, made: weakref.ref[Tensor], _: Tensor) -> None:

@@ -21,6 +21,9 @@ class Poisson(Operator):
         shape = _check.shape("Poisson", shape)
         super().__init__(shape, _check.lengths("Poisson", length, len(shape)), {})
 
+    def _settings(self) -> dict[str, object]:
+        return _of_length(self.parameters)
+
 
 class Heat(Operator):
     """The operator of an implicit Euler step of the heat equation: I - nu dt L, with the Laplacian L of `Poisson`.
@@ -37,6 +40,9 @@ class Heat(Operator):
         shape = _check.shape("Heat", shape)
         parameters = [_check.real("Heat", "dt", dt), *_check.lengths("Heat", length, len(shape))]
         super().__init__(shape, parameters, {"nu": nu})
+
+    def _settings(self) -> dict[str, object]:
+        return _of_time(self.parameters)
 
 
 class Burgers(Operator):
@@ -60,6 +66,9 @@ class Burgers(Operator):
 
     def __init__(self, winds: Tensor, nu: Number, dt: float, length: Length = 1.0) -> None:
         super().__init__(*flow("Burgers", "winds", winds, nu, dt, length))
+
+    def _settings(self) -> dict[str, object]:
+        return _of_time(self.parameters)
 
     def _unknowns(self) -> int:
         return self.tensors[0].shape[1] * super()._unknowns()
@@ -90,8 +99,20 @@ class NavierStokes(Operator):
     def __init__(self, velocity: Tensor, nu: Number, dt: float, length: Length = 1.0) -> None:
         super().__init__(*flow("NavierStokes", "velocity", velocity, nu, dt, length))
 
+    def _settings(self) -> dict[str, object]:
+        return _of_time(self.parameters)
+
     def _unknowns(self) -> int:
         return 3 * super()._unknowns()
+
+
+def _of_length(lengths: list[float]) -> dict[str, object]:
+    """The lengths of the sides; none are 1."""
+    return {"length": tuple(lengths)} if lengths else {}
+
+
+def _of_time(parameters: list[float]) -> dict[str, object]:
+    return {"dt": parameters[0], **_of_length(parameters[1:])}
 
 
 def flow(

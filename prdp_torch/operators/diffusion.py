@@ -108,6 +108,10 @@ class Diffusion(Operator):
         null_spaces = () if is_held else (kappa.new_empty(0).detach(),) * 2
         super().__init__(list(shape), parameters, given, null_spaces)
 
+    def _settings(self) -> dict[str, object]:
+        faces = "arithmetic" if self.parameters[-1] else "harmonic"
+        return {"boundary": self.boundary, "length": self.length, "faces": repr(faces)}
+
     @property
     def kappa(self) -> Tensor:
         """κ as it was given."""

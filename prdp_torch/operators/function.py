@@ -13,7 +13,7 @@ from torch import Tensor
 
 from prdp_torch import _C, _check, batching
 from prdp_torch.closures import warn_of_shared
-from prdp_torch.operators.base import Operator, null_spaces_of
+from prdp_torch.operators.base import Operator, null_spaces_of, shown
 from prdp_torch.types import NullSpace
 
 Product: TypeAlias = Callable[..., Tensor]
@@ -78,6 +78,10 @@ class Function(Operator):
         null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
         given = {f"tensors_{i}": t for i, t in enumerate(tensors)}
         super().__init__([self._products.number], [], given, null_spaces)
+
+    def __repr__(self) -> str:
+        name = getattr(self._made_of[0], "__name__", type(self._made_of[0]).__name__)
+        return f"Function({name}, tensors=[{', '.join(map(shown, self.tensors))}])"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Function":
         warn_of_shared("Function", self._made_of[:3], memo)

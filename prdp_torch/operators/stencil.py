@@ -73,9 +73,8 @@ class Stencil(Operator):
         null_spaces = null_spaces_of("Stencil", nullspace, left_nullspace, coefficients)
         super().__init__(list(coefficients.shape[2:]), periodic + cells, {"coefficients": coefficients}, null_spaces)
 
-    def __repr__(self) -> str:
-        shape, tensors = tuple(self.shape), ", ".join(f"tensor{tuple(t.shape)}" for t in self.tensors)
-        return f"Stencil(shape={shape}, offsets={self.offsets}, boundary={self.boundary}, tensors=[{tensors}])"
+    def _settings(self) -> dict[str, object]:
+        return {"offsets": self.offsets, "boundary": self.boundary}
 
 
 def _offsets(offsets: Sequence[Sequence[int]], coefficients: tuple[int, ...]) -> list[tuple[int, ...]]:

@@ -255,9 +255,16 @@ def solve(c, b):
 
 def test_repr():
     assert repr(operators.Stencil(C, NEAREST[2], "periodic")) == (
-        "Stencil(shape=(4, 6), offsets=[(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)], "
-        "boundary=('periodic', 'periodic'), tensors=[tensor(2, 5, 4, 6)])"
+        "Stencil(shape=(4, 6), coefficients=tensor(2, 5, 4, 6), "
+        "offsets=[(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)], boundary=('periodic', 'periodic'))"
     )
+    assert repr(operators.Heat((8,), nu=0.1, dt=0.2, length=3.0)) == "Heat(shape=(8,), nu=0.1, dt=0.2, length=(3.0,))"
+    assert repr(operators.Diffusion(torch.ones(1, 8), shift=2.0, boundary=[("flux", ("robin", 0.5))])) == (
+        "Diffusion(shape=(8,), kappa=tensor(1, 8), shift=2, robin_0_high=0.5, boundary=[('flux', 'robin')], "
+        "length=(1.0,), faces='harmonic')"
+    )
+    assert repr(operators.Diffusion(torch.ones(1, 8), boundary="flux")).endswith("nullspace='constant')")
+    assert repr(operators.Function(torch.neg, tensors=[C])) == "Function(neg, tensors=[tensor(2, 5, 4, 6)])"
 
 
 THREE = torch.tensor([4.3, -1.0, -1.5]).view(1, 3, 1).repeat(2, 1, 16)
