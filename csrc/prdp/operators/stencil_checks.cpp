@@ -3,6 +3,7 @@
 #include <sstream>
 
 #include "prdp/operators/stencil_operator.h"
+#include "prdp/operators/tensors.h"
 
 /// What a Stencil is made of, and what of it is refused.
 namespace prdp {
@@ -114,13 +115,7 @@ void StencilOperator::check_vector(const at::Tensor& b) const {
     TORCH_CHECK_VALUE(false, "Stencil: expected (batch, channel", expected.str(), "), got ", sizes);
   }
   TORCH_CHECK_VALUE(sizes[1] != 0, "Stencil: a vector must have at least one channel, got ", sizes);
-  TORCH_CHECK_VALUE(coefficients_.sym_size(0) == 1 || coefficients_.sym_size(0) == sizes[0],
-                    "Stencil: the coefficients hold ", coefficients_.sym_size(0), " samples, the vector holds ",
-                    sizes[0]);
-  TORCH_CHECK_TYPE(b.scalar_type() == coefficients_.scalar_type(), "Stencil: the coefficients are ",
-                   coefficients_.scalar_type(), " but the vector is ", b.scalar_type());
-  TORCH_CHECK_VALUE(b.device() == coefficients_.device(), "Stencil: the coefficients are on ", coefficients_.device(),
-                    " but the vector is on ", b.device());
+  check_goes_with(coefficients_, b, "Stencil", "the coefficients");
 }
 
 }  // namespace prdp

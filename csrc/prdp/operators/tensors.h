@@ -87,6 +87,16 @@ inline at::Tensor padded(const at::Tensor& t, int64_t axis, int64_t before, int6
   return at::constant_pad_nd(t, pad);
 }
 
+/// Raises unless `given`, "the winds" of `owner`, has the dtype and device of the vector, and its batch or 1.
+inline void check_goes_with(const at::Tensor& given, const at::Tensor& vector, const char* owner, const char* name) {
+  TORCH_CHECK_VALUE(given.sym_size(0) == 1 || given.sym_size(0) == vector.sym_size(0), owner, ": ", name, " hold ",
+                    given.sym_size(0), " samples, the vector holds ", vector.sym_size(0));
+  TORCH_CHECK_TYPE(vector.scalar_type() == given.scalar_type(), owner, ": ", name, " are ", given.scalar_type(),
+                   " but the vector is ", vector.scalar_type());
+  TORCH_CHECK_VALUE(vector.device() == given.device(), owner, ": ", name, " are on ", given.device(),
+                    " but the vector is on ", vector.device());
+}
+
 /// (channels, *shape)
 inline std::vector<int64_t> with_channels(int64_t channels, at::IntArrayRef shape) {
   std::vector<int64_t> sizes{channels};

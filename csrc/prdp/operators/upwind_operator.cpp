@@ -12,12 +12,7 @@ UpwindOperator::UpwindOperator(const char* owner, const OperatorSpec& spec, int6
 
 void UpwindOperator::check_vector(const at::Tensor& b) const {
   grid_.check_field(b, channels_);
-  TORCH_CHECK_VALUE(winds_.sym_size(0) == 1 || winds_.sym_size(0) == b.sym_size(0), step_.owner, ": the winds hold ",
-                    winds_.sym_size(0), " samples, the vector holds ", b.sym_size(0));
-  TORCH_CHECK_TYPE(b.scalar_type() == winds_.scalar_type(), step_.owner, ": the winds are ", winds_.scalar_type(),
-                   " but the vector is ", b.scalar_type());
-  TORCH_CHECK_VALUE(b.device() == winds_.device(), step_.owner, ": the winds are on ", winds_.device(),
-                    " but the vector is on ", b.device());
+  check_goes_with(winds_, b, step_.owner, "the winds");
 }
 
 std::vector<int64_t> UpwindOperator::vector_shape() const { return with_channels(channels_, grid_.shape()); }
