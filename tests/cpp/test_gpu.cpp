@@ -5,6 +5,7 @@
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/solvers/solve_kernel_text.h"
 
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
                                   int left_out, bool poisons, bool captures, int64_t most_blocks, bool from_ptx);
@@ -38,6 +39,23 @@ TEST(Gpu, ASolveWithItsGradientIsTwoLaunchesWithoutPython) {
   };
   EXPECT_LT(error(u, b), 1e-10);
   EXPECT_LT(error(leaf.grad(), weights), 1e-10);
+}
+
+/// Kernels count by an int. Up to there a team of all blocks takes any sample, some points a thread.
+TEST(Gpu, ASampleThatAKernelCannotCountIsRefusedInWords) {
+  const prdp::gpu::Limits limits{.block_memory = 96 << 10, .cells_of_block = 16384, .threads = 1024, .blocks = 132};
+  const auto kernel_for = [&](int64_t unknowns) {
+    const auto b = at::zeros({1}).expand({2, 1, unknowns});  // without memory
+    return prdp::gpu::solve_kernel({.type = "Heat<float>"}, /*is_saddle_point=*/false, prdp::CG{}, b, limits);
+  };
+  constexpr int64_t most = (int64_t{1} << 30) - 1;
+  EXPECT_EQ(kernel_for(most).source.blocks_of_team, 132);
+  try {
+    kernel_for(most + 1);
+    FAIL() << "no refusal";
+  } catch (const prdp::gpu::Unavailable& refused) {
+    EXPECT_STREQ(refused.what(), "a sample of 1073741824 unknowns is too large for a kernel");
+  }
 }
 
 }  // namespace
