@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 from helpers import field, random, spd_matrices
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, linearize, vjp, vmap
 from torch.utils._pytree import tree_leaves
@@ -212,3 +213,27 @@ def test_tensors_without_their_values_in_memory(disguise):
             u = prdp.linear_solve(m, rhs, prdp.CG(20))[0]
             found.append((u, *torch.autograd.grad(u.square().sum(), rhs)))
         close(found[0], found[1], rtol=0, atol=0)
+
+
+def advection(winds):
+    return operators.Burgers(winds, nu=0.1, dt=0.2)
+
+
+@pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")  # of linearize
+def test_products_have_tangents_in_every_mode():
+    winds, u, v = random(2, 1, 9, seed=1), random(2, 1, 9, seed=2), random(2, 1, 9, seed=3)
+    for product in (advection(winds).apply, advection(winds).apply_transpose):
+        exact = product(v)
+        with forward_ad.dual_level():
+            close(forward_ad.unpack_dual(product(forward_ad.make_dual(u, v))), (product(u), exact))
+        close(jvp(product, (u,), (v,)), (product(u), exact))
+        close(linearize(product, u)[1](v), exact)
+        close(jacfwd(product)(u), jacrev(product)(u))
+        second = jvp(grad(lambda w, of=product: of(w).pow(3).sum()), (u,), (v,))[1]
+        other = product.__self__.apply_transpose if product.__name__ == "apply" else product.__self__.apply
+        close(second, other(6 * product(u) * exact))
+    # A depends on u as well
+    moved = jvp(lambda w: advection(w).apply(w), (u,), (v,))[1]
+    step = 1e-6
+    ahead, behind = (advection(u + s * v).apply(u + s * v) for s in (step, -step))
+    close(moved, (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-8)
