@@ -1,7 +1,6 @@
 """Controllers: they choose K or the tolerance of the solves after each training interval."""
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, Unpack
 
@@ -75,7 +74,7 @@ class _Attached(_Compiled):
     def _decide(self, metric: float, converged: bool | None, error: float | None) -> bool:
         """One step of the compiled controller, and what follows from it for the steppers."""
         if converged is None:
-            converged = bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
+            converged = bool(self.steppers) and all(getattr(s, "converged", None) is True for s in self.steppers)
         ended = Ended.of(self.steppers)
         refined = self._step(*Interval.of_processes(metric, bool(converged), error, ended, self.process_group))
         self._push()
@@ -90,7 +89,7 @@ class _Attached(_Compiled):
         lasts = self._warned_unrefined_for == PATIENCE or self._warned_for == LONG_PATIENCE
         if lasts and not self._has_spoken:
             self._has_spoken = True
-            warnings.warn(f"{warning} (said once; `.warning` has the state of the last interval)", stacklevel=5)
+            _C.warn(f"{warning} (said once; `.warning` has the state of the last interval)")
 
     def _recorded(self, record: Callable[[list[Row], int], R]) -> list[R]:
         """The history, of `record(rows, number)` each. Those made before are kept: a loop that reads the last one would

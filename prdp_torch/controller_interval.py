@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import torch
 
 from prdp_torch import _C, data_parallel
-from prdp_torch.solve import SolveStatus
+from prdp_torch.solve import SolveInfo, SolveStatus
 from prdp_torch.types import Refinable
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class Ended(NamedTuple):
     def of(cls, steppers: list[Refinable]) -> Self:
         residuals, idle = [], [0.0]
         for info in (getattr(stepper, "info", None) for stepper in steppers):
-            if info is None:
+            if not isinstance(info, SolveInfo):  # it has not solved yet, or is of somebody else's kind
                 residuals.append((0.0, 0.0))
                 continue
             parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations, info.status)])

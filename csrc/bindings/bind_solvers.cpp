@@ -211,6 +211,7 @@ void bind_solvers(py::module_& m) {
   };
   not_of_user = new py::tuple(py::make_tuple(files_of("prdp_torch"), files_of("torch"), "<frozen "));
   set_warning_sink(warn_in_python);
+  m.def("warn", warn_in_python, "Warn, at the line of the user's that led here.", py::arg("text"));
   main_thread = py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
   interruption::set_check(check_signals);
   m.attr("DEFAULT_RTOL") = kDefaultRtol;

@@ -1,13 +1,12 @@
 """Matrices, and what else is taken for an operator."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Self
 
 import torch
 from torch import Tensor
 
-from prdp_torch import _check, torch_private
+from prdp_torch import _C, _check, torch_private
 from prdp_torch.operators.base import Operator, full_precision, null_spaces_of
 from prdp_torch.types import NullSpace
 
@@ -129,10 +128,9 @@ def _warn_of_csr_gradient(matrix: Tensor) -> None:
     global _warned_of_csr_gradient
     if matrix.requires_grad and torch.is_grad_enabled() and not _warned_of_csr_gradient:
         _warned_of_csr_gradient = True
-        warnings.warn(
+        _C.warn(
             "linear_solve: the gradient of a sparse CSR tensor passes through torch, which may make it dense; "
-            "operators.Matrix.csr(crow, col, values, size) takes it to the values directly",
-            stacklevel=4,
+            "operators.Matrix.csr(crow, col, values, size) takes it to the values directly"
         )
 
 

@@ -154,8 +154,8 @@ def test_a_metric_that_grows_is_said(make):
         controller.step(metric)
         assert controller.warning is None
     controller.step(0.7)
-    said = f"the {metric_of(controller)} grows: 7.0e-01 after 1.0e-01 in interval 2; lower the learning rate"
-    assert controller.warning.startswith(f"{type(controller).__name__}: {said}")
+    said = "7.0e-01 after 1.0e-01 in interval 2; lower the learning rate, solve further"
+    assert controller.warning.startswith(f"{type(controller).__name__}: the {metric_of(controller)} grows: {said}")
     controller.step(0.15)
     assert controller.warning is None
 

@@ -1,7 +1,9 @@
 """What a controller warns of: solves that make the error, take no iteration, or stall."""
 
+import importlib
 import warnings
 
+import pytest
 import torch
 from helpers import field, heat_step
 
@@ -108,3 +110,39 @@ def test_an_error_that_never_falls_names_loose_adjoint_solves():
     for _ in range(25):
         exact.step(0.95)
     assert exact.warning is None
+
+
+class Foreign:
+    """A solver of somebody else's, whose attributes have names of ours."""
+
+    def __init__(self, **attributes):
+        self.max_iter = 1
+        vars(self).update(attributes)
+
+
+@pytest.mark.parametrize("attributes", [
+    {"converged": lambda: False}, {"converged": torch.tensor([True, True])}, {"info": {"its": 3}}, {"info": 3},
+])  # fmt: skip
+def test_names_that_mean_something_else_are_not_read(attributes):
+    solver = Foreign(**attributes)
+    controller = prdp.PRDPController([solver], window=1, delta=2)
+    for _ in range(5):
+        controller.step(1.0)
+    assert solver.max_iter == controller.max_iter == 2
+
+
+def test_a_bool_is_believed():
+    solver = Foreign(converged=True)
+    controller = prdp.PRDPController([solver], window=1, delta=2)
+    for _ in range(5):
+        controller.step(1.0)
+    assert solver.max_iter == 1
+
+
+def test_a_warning_points_at_the_call_of_step():
+    importlib.import_module("torch._dynamo")  # as every optimiser does; calls go through torch from then on
+    controller = prdp.PRDPController()
+    with pytest.warns(UserWarning, match="the metric grows") as said:
+        for metric in range(1, 40):
+            controller.step(float(metric))
+    assert [warning.filename for warning in said] == [__file__]

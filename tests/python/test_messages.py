@@ -62,6 +62,8 @@ TABLE = [
      'CG with preconditioner="diagonal" on NavierStokes: the pressure rows have a zero diagonal; take GMRES'),
     ("ZERO_DIAGONAL", FLOW, flow_state(), prdp.GMRES(**BY_DIAGONAL),
      r'GMRES\(10\) with preconditioner="diagonal" on NavierStokes: .* take GMRES without it'),
+    ("ZERO_DIAGONAL", operators.Diffusion(1e20 ** torch.linspace(-1.5, 1, 8).view(1, 8)), torch.ones(1, 1, 8),
+     prdp.CG(**BY_DIAGONAL), "it divides by the diagonal of A, whose least number is lost beside the largest; take"),
     ("ZERO_DIAGONAL", SWAP, E1, prdp.Jacobi(9), r"in row \(0\), Jacobi on Matrix: it divides by .*; take GMRES"),
     ("ZERO_DIAGONAL", ZERO, GRID, prdp.Jacobi(9), r"in row \(0, 0\), Jacobi on Stencil: it divides by .*; take GMRES"),
     *[("INCONSISTENT", FLOW, flow_state(2.0), solver,

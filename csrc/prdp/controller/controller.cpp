@@ -78,7 +78,8 @@ std::string Controller::about_metric() const {
       std::all_of(history.end() - kGrown, history.end(), [&](const Record& r) { return r.metric > bound; });
   if (!grows) return {};
   text << "the " << metric_name() << " grows: " << history.back().metric << " after " << least->metric
-       << " in interval " << least - history.begin() << "; lower the learning rate, or go back to the weights of then";
+       << " in interval " << least - history.begin() << "; lower the learning rate, solve further, or go back to the weights "
+          "of then";
   return text.str();
 }
 
@@ -86,8 +87,8 @@ std::string Controller::about_residual() const {
   const auto& history = state().history;
   if (idle_ > 0.5)
     return std::string(name()) +
-           ": most of the last solves took no iteration, as their start met rtol, so that the step hardly changes the "
-           "state; start from zero, solve for the change of the state, or take a finer rtol";
+           ": most of the last solves took no iteration, as their start met rtol. Steps in time then hardly change the "
+           "state: start them from zero, solve for the change of the state, or take a finer rtol";
   if (history.empty() || !history.back().residual) return {};
   const auto& last = history.back();
   const double residual = *last.residual;

@@ -211,17 +211,23 @@ std::string stopped(const FailedSample& sample) {
   return "take more iterations, a preconditioner, GMRES or Direct";
 }
 
+const char* zero_on_diagonal(const FailedSample& sample) {
+  if (sample.has_pressure()) return "the pressure rows have a zero diagonal";
+  if (sample.of(sample.a.diagonal()).eq(0).any().item<bool>())
+    return "it divides by the diagonal of A, which has a zero there";
+  if (sample.preconditioner().is_multigrid() || sample.solver().method == Method::kMultigrid)
+    return "multigrid finds no coarse grid for A: a diagonal vanishes, or a number leaves the range of the dtype, on "
+           "one "
+           "of them";
+  return "it divides by the diagonal of A, whose least number is lost beside the largest";
+}
+
 std::string zero_diagonal(const FailedSample& sample) {
-  const bool has_zero = sample.of(sample.a.diagonal()).eq(0).any().item<bool>();
-  const char* cause = sample.has_pressure() ? "the pressure rows have a zero diagonal; take "
-                      : has_zero            ? "it divides by the diagonal of A, which has a zero there; take "
-                                            : "multigrid finds no coarse grid for A: a diagonal vanishes, or a number "
-                                              "leaves the range of the dtype, on one of them; take ";
   const auto made_for = sample.method().made_for;
   const bool takes_any_diagonal = made_for == MadeFor::kAny || made_for == MadeFor::kSymmetric;
-  if (sample.preconditioner().is_diagonal() && takes_any_diagonal)
-    return c10::str(cause, sample.method().label, " without it");
-  return c10::str(cause, "GMRES");
+  const bool is_to_blame = sample.preconditioner().is_diagonal() && takes_any_diagonal;
+  return c10::str(zero_on_diagonal(sample), "; take ", is_to_blame ? sample.method().label : "GMRES",
+                  is_to_blame ? " without it" : "");
 }
 
 std::string nonfinite_input(const FailedSample& sample) {
