@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import field, statuses
+from helpers import field, random, statuses
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -153,3 +153,26 @@ def test_truncated_iterations_keep_their_own_derivative():
     u, info = prdp.linear_solve(a, b, prdp.CG(3, rtol=0.0), backward="unrolled")
     u[0, 0, 3].backward()
     assert info.adjoint.residual.isnan().all() and statuses(info) == ["MAX_ITER"]
+
+
+@pytest.mark.parametrize(
+    "solver", [prdp.BiCGStab(50, 1e-3), prdp.CG(50, 1e-2), prdp.BiCGStab(50, 1e-3, preconditioner="diagonal")], ids=repr
+)
+def test_neighbours_that_share_a_tensor_do_not_decide_which_derivative_a_sample_gets(solver):
+    kinds = set()
+    for seed in range(40):
+        b, w = random(2, 4, 1, 12, seed=seed)
+
+        def gradient(samples, b=b, w=w):
+            kappa = torch.linspace(0.3, 1.7, 12, dtype=torch.float64).view(1, 12).requires_grad_()
+            some = b[samples].clone().requires_grad_()
+            u, info = prdp.linear_solve(operators.Diffusion(kappa, shift=1.0), some, solver, "unrolled")
+            (u * w[samples]).sum().backward()
+            return some.grad, info.adjoint.residual.isfinite()  # NaN where iterations are differentiated
+
+        together, implicit = gradient([0, 1, 2, 3])
+        for i in range(4):
+            alone, implicit_alone = gradient([i])
+            assert torch.equal(together[i : i + 1], alone) and implicit[i] == implicit_alone[0]
+            kinds.add(bool(implicit[i]))
+    assert kinds == {False, True}

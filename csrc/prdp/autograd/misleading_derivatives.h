@@ -22,7 +22,8 @@ Rows misleading_b_bar(const Operator& a, const at::Tensor& cotangent, const at::
                       const std::vector<double>& allowed);
 
 /// Those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than allowed. `gradients` (b first) are
-/// sums over `rows` alone. Samples that share a tensor of A are looked at together: it has the sum of their gradients.
+/// sums over `rows` alone. Samples that share a tensor of A are looked at together, as it has the sum of their
+/// gradients: give one to judge it alone.
 Rows misleading_a_bar(const OperatorSpec& spec, const std::vector<at::Tensor>& gradients, const at::Tensor& u,
                       at::IntArrayRef needed, const Rows& rows, const std::vector<double>& allowed);
 

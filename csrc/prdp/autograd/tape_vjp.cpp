@@ -95,6 +95,7 @@ UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Unr
       if (needed[i + 1] && of_samples[s][i].defined())
         add_sample(found.gradients[i + 1], solve.a.tensors[i], of_samples[s][i], s);
   if (for_diagonal) add_diagonals(found.gradients, diagonal_bar, solve, needed);
+  else found.of_samples = std::move(of_samples);
   return found;
 }
 

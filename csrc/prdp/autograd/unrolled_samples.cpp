@@ -81,6 +81,7 @@ class SampleVjps {
   const Rows has_finite_cotangent_ = finite_rows(cotangent_);  // the others are refused
   const at::Tensor finite_cotangent_ = only(cotangent_, has_finite_cotangent_);
   Differentiated found_{};
+  std::vector<std::vector<at::Tensor>> of_samples_{};  // as UnrolledVjp has them
   at::Tensor u_{};
 
   Rows finite_inverses() const {
@@ -114,7 +115,8 @@ class SampleVjps {
   Differentiated differentiate(Rows rows) {
     std::vector<SampleOutcome> outcomes(batch_);
     auto gradients = finite_sum(rows, [&](const Rows& some) {
-      auto [sum, applications] = vjp_of_iterations(some);
+      auto [sum, applications, of_samples] = vjp_of_iterations(some);
+      of_samples_ = std::move(of_samples);
       const auto products = to_host<int64_t>(applications, batch_);
       for (int64_t i = 0; i < batch_; ++i)
         outcomes[i] = {status(i), counts_[i], products[i], std::numeric_limits<double>::quiet_NaN()};
@@ -181,11 +183,8 @@ class SampleVjps {
     auto misleading = misleading_b_bar(*a_, finite_cotangent_, found_.gradients[0], rows, allowed);
     for (int64_t i = 0; i < batch_; ++i) rows[i] = rows[i] && !misleading[i];
     if (needs_gradient_of_a_ && any(rows)) {
-      const auto found = gradients_of(rows);
-      if (found[0].defined()) {
-        const auto more = misleading_a_bar(spec_, found, solution().detach(), needed_, rows, allowed);
-        for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || more[i];
-      }
+      const auto more = can_be_alone() ? misleading_alone(rows, allowed) : misleading_together(rows, allowed);
+      for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || more[i];
     }
     if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)
@@ -193,6 +192,42 @@ class SampleVjps {
     found_ = differentiate(found_.finite);
   }
 
+  /// Whether samples share a tensor of A, so that its gradient is a sum over them, and can be taken out of the batch: a
+  /// function and a preconditioner of the user's own see all of it.
+  bool can_be_alone() const {
+    if (batch_ == 1 || is_function(spec_) || options_.solver.preconditioner.is_operator()) return false;
+    for (size_t k = 0; k < spec_.tensors.size(); ++k)
+      if (needed_[k + 1] && !is_of_samples(spec_, k, batch_)) return true;
+    return false;
+  }
+  /// Those whose Ā misleads, each judged by its own, so that its neighbours do not decide what it gets.
+  Rows misleading_alone(const Rows& rows, const std::vector<double>& allowed) {
+    Rows misleading(batch_);
+    const auto caps = solved_.iterations.to(at::kLong);
+    for (int64_t i = 0; i < batch_; ++i) {
+      if (!rows[i]) continue;
+      const auto one = [&](const at::Tensor& t) { return t.defined() ? t.narrow(0, i, 1) : t; };
+      auto a = spec_;
+      for (size_t k = 0; k < a.tensors.size(); ++k)
+        if (is_of_samples(spec_, k, batch_)) a.tensors[k] = one(a.tensors[k]);
+      std::vector<at::Tensor> found;
+      if (!of_samples_.empty()) {
+        found = of_samples_[i];
+        found.insert(found.begin(), one(found_.gradients[0]));
+      } else {
+        const UnrolledSolve solve{a, one(solved_.x0), options_.solver, one(caps), options_.checkpoint_every};
+        found = of_iterations_(one(finite_cotangent_), one(solved_.b), solve, wanted_).gradients;
+      }
+      misleading[i] =
+          found[0].defined() && misleading_a_bar(a, found, one(solution()).detach(), needed_, {true}, {allowed[i]})[0];
+    }
+    return misleading;
+  }
+  Rows misleading_together(const Rows& rows, const std::vector<double>& allowed) {
+    const auto found = gradients_of(rows);
+    if (!found[0].defined()) return Rows(batch_);
+    return misleading_a_bar(spec_, found, solution().detach(), needed_, rows, allowed);
+  }
   /// Those of the iterations of these samples alone; undefined where none ran.
   std::vector<at::Tensor> gradients_of(const Rows& rows) const {
     for (int64_t i = 0; i < batch_; ++i)

@@ -43,10 +43,12 @@ struct UnrolledSolve {
 };
 
 /// The gradients of b and of each tensor, undefined where `needed` (b first) is 0 or there is no derivative; and the
-/// number of products with A and Aᵀ for each sample.
+/// number of products with A and Aᵀ for each sample. Where the way there has them, also what each sample adds to the
+/// gradient of each tensor of A; empty for samples that did not run.
 struct UnrolledVjp {
   std::vector<at::Tensor> gradients;
   at::Tensor operator_applications;
+  std::vector<std::vector<at::Tensor>> of_samples{};
 };
 
 /// Computes them with a tape of the operations in the CPU loops (tape.h), one iteration of one sample at a time; for
