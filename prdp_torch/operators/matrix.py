@@ -23,7 +23,6 @@ class Matrix(Operator):
         if not isinstance(matrix, torch.Tensor):
             raise TypeError(f"Matrix: expected a torch tensor, got {type(matrix).__name__}")
         if matrix.layout == torch.sparse_csr:
-            _warn_of_csr_gradient(matrix)
             self.kind: str = "csr"
             with torch_private.without_transforms():
                 given = {"crow": matrix.crow_indices(), "col": matrix.col_indices(), "values": matrix.values()}
@@ -44,6 +43,8 @@ class Matrix(Operator):
             )
         like = given["values" if self.kind == "csr" else "matrix"]
         super().__init__([], [], given, null_spaces_of("Matrix", nullspace, left_nullspace, like))
+        if self.kind == "csr":
+            _check_csr_gradient(matrix, given["crow"], given["col"])
 
     def apply(self, v: Tensor) -> Tensor:
         """Return A v, with gradients. v: (batch, n), or (n,)."""
@@ -121,12 +122,30 @@ class Matrix(Operator):
         return made
 
 
+def _has_sorted_columns(crow: Tensor, col: Tensor) -> bool:
+    """Whether the columns of each row increase, (n + 1,) and (nnz,) or a batch of them."""
+    n = crow.shape[-1] - 1
+    for pointers, columns in zip(crow.view(-1, n + 1), col.view(-1, col.shape[-1]), strict=True):
+        rows = torch.arange(n, device=crow.device).repeat_interleave(pointers.diff())
+        if not bool(((rows * n + columns).diff() > 0).all()):
+            return False
+    return True
+
+
 _warned_of_csr_gradient = False
 
 
-def _warn_of_csr_gradient(matrix: Tensor) -> None:
+def _check_csr_gradient(matrix: Tensor, crow: Tensor, col: Tensor) -> None:
+    """Refuse a sparse tensor whose gradient torch gets wrong, and warn once of one that it may make dense."""
     global _warned_of_csr_gradient
-    if matrix.requires_grad and torch.is_grad_enabled() and not _warned_of_csr_gradient:
+    if not matrix.requires_grad or not torch.is_grad_enabled() or torch.compiler.is_compiling():
+        return
+    if matrix.grad_fn is not None and not _has_sorted_columns(crow, col):
+        raise ValueError(
+            "linear_solve: torch gives the gradient of this sparse CSR tensor to the wrong values, as the columns of a "
+            "row are not sorted, or repeat; take operators.Matrix.csr(crow, col, values, size), or sort them"
+        )
+    if not _warned_of_csr_gradient:
         _warned_of_csr_gradient = True
         _C.warn(
             "linear_solve: the gradient of a sparse CSR tensor passes through torch, which may make it dense; "

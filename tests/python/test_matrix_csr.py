@@ -111,3 +111,29 @@ def test_a_csr_tensor_with_a_gradient_warns_once(monkeypatch):
 def test_mistakes(call, error, message):
     with pytest.raises(error, match="Matrix.csr: .*" + message):
         call(entries())
+
+
+@pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor", "ignore:Sparse invariant")
+@pytest.mark.parametrize(("columns", "right"), [([1, 0, 1, 0], False), ([0, 0, 0, 1], False), ([0, 1, 0, 1], True)])
+def test_torchs_wrong_gradient_of_unsorted_columns_is_refused(columns, right):
+    values = torch.tensor([1.0, 4.0, 5.0, 2.0], dtype=torch.float64, requires_grad=True)
+    crow, col, b = torch.tensor([0, 2, 4]), torch.tensor(columns), torch.tensor([[1.0, 2.0]], dtype=torch.float64)
+    matrix = torch.sparse_csr_tensor(crow, col, values, (2, 2))
+
+    def gradient(a):
+        u, _ = prdp.linear_solve(a, b, prdp.Direct())
+        return torch.autograd.grad((u * torch.tensor([1.0, 3.0])).sum(), values)[0]
+
+    exact = torch.zeros(2, 2, dtype=torch.float64).index_put((torch.arange(4) // 2, col), values, accumulate=True)
+    expected = torch.autograd.grad((torch.linalg.solve(exact, b[0]) * torch.tensor([1.0, 3.0])).sum(), values)[0]
+    torch.testing.assert_close(gradient(operators.Matrix.csr(crow, col, values, 2)), expected)
+    if right:
+        torch.testing.assert_close(gradient(matrix), expected)
+    else:
+        with pytest.raises(ValueError, match="the wrong values, as the columns of a row are not sorted, or repeat"):
+            gradient(matrix)
+        batch = torch.sparse_csr_tensor(crow.expand(3, -1), col.expand(3, -1), values.expand(3, -1), (3, 2, 2))
+        with pytest.raises(ValueError, match="not sorted"):
+            operators.Matrix(batch)
+    with torch.no_grad():  # without a gradient nothing is wrong
+        torch.testing.assert_close(prdp.linear_solve(matrix, b, prdp.Direct())[0][0], torch.linalg.solve(exact, b[0]))
