@@ -50,6 +50,28 @@ class AdjointLog:
         return AdjointLog, ()
 
 
+class LogOfStep(AdjointLog):
+    """That of a step of a rollout within the one log of all, which is the only one that a compiled graph can hold."""
+
+    def __init__(self, log: AdjointLog, step: int) -> None:
+        self.number = log.number + 1 + step
+
+
+class LogOfRollout(AdjointLog):
+    """One log for a row of steps, read as (batch, steps)."""
+
+    def __init__(self, log: AdjointLog, steps: int) -> None:
+        self.log, self.steps = log, steps
+
+    def of_step(self, step: int) -> LogOfStep:
+        """`step` is counted from 0."""
+        return LogOfStep(self.log, step)
+
+    def read(self) -> "SolveInfo | None":
+        entry = _C.join_adjoint_logs([self.of_step(step).number for step in range(self.steps)])
+        return None if entry is None else SolveInfo(*entry)
+
+
 class AdjointLogs(list[AdjointLog]):
     """The logs of a row of steps, one each; read as (batch, steps)."""
 

@@ -12,7 +12,7 @@ from prdp_torch.batching import outlive_transforms
 from prdp_torch.calls import forgets_if_it_raises
 from prdp_torch.operators.base import full_precision
 from prdp_torch.operators.matrix import as_operator
-from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
+from prdp_torch.solve import AdjointLog, AdjointLogs, LogOfRollout, SolveInfo
 from prdp_torch.solvers import Solver
 from prdp_torch.stepper_settings import HasSettings
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Report, Solution, Start
@@ -115,12 +115,12 @@ class Stepper(HasSettings):
             if _check.whole("rollout", "steps", steps) < 0:
                 raise ValueError(f"rollout: steps must be >= 0, got {steps}")
         u = full_precision(u)
-        logs = AdjointLogs(0 if compiling else steps)
+        logs = LogOfRollout(self._adjoint_log, steps) if compiling else AdjointLogs(steps)
         step_from = self._called if self._calls_do_more_than(Stepper.forward) else self._solve
         states, reports = [u], []
         for step in range(steps):
-            if compiling:
-                found = step_from(states[-1], self._adjoint_log)
+            if isinstance(logs, LogOfRollout):
+                found = step_from(states[-1], logs.of_step(step))
             else:
                 with _C.StepOfRollout(step + 1, steps):
                     found = step_from(states[-1], logs[step])
@@ -133,9 +133,8 @@ class Stepper(HasSettings):
             report = [
                 u.new_empty((len(u), 0), dtype=t) for t in (torch.int64, u.dtype, torch.int64, torch.int64, u.dtype)
             ]
-        log = self._adjoint_log if compiling else logs
         all_states = torch.stack(states, 1)
-        self._keep(cast(Report, tuple(report)) if all(reports) else None, log, all_states)
+        self._keep(cast(Report, tuple(report)) if all(reports) else None, logs, all_states)
         return all_states
 
     def _calls_do_more_than(self, forward: Callable[..., Tensor]) -> bool:

@@ -11,8 +11,10 @@ namespace {
 /// may be waiting for this mutex: nothing is destroyed while it is held.
 struct Logs {
   std::mutex mutex;
-  std::unordered_map<int64_t, std::optional<SolveInfo>> entries;
+  std::unordered_map<int64_t, std::unordered_map<int64_t, std::optional<SolveInfo>>> entries;  // by log, then by step
   int64_t last = 0;
+
+  static constexpr int64_t kNumbers = kSteps + 1;
 };
 
 Logs& logs() {
@@ -25,26 +27,28 @@ Logs& logs() {
 int64_t open() {
   const std::lock_guard lock(logs().mutex);
   logs().entries[++logs().last];
-  return logs().last;
+  return logs().last * Logs::kNumbers;
 }
 
 void close(int64_t log) {
   decltype(Logs::entries)::node_type closed;
   const std::lock_guard lock(logs().mutex);
-  closed = logs().entries.extract(log);
+  closed = logs().entries.extract(log / Logs::kNumbers);
 }
 
 std::optional<SolveInfo> read(int64_t log) {
   const std::lock_guard lock(logs().mutex);
-  const auto entry = logs().entries.find(log);
-  return entry == logs().entries.end() ? std::nullopt : entry->second;
+  const auto entry = logs().entries.find(log / Logs::kNumbers);
+  if (entry == logs().entries.end()) return std::nullopt;
+  const auto found = entry->second.find(log % Logs::kNumbers);
+  return found == entry->second.end() ? std::nullopt : found->second;
 }
 
 void write(int64_t log, const SolveInfo& info) {
   std::optional<SolveInfo> other = info;  // the new one, and then the one before it
   const std::lock_guard lock(logs().mutex);
-  const auto entry = logs().entries.find(log);
-  if (entry != logs().entries.end()) entry->second.swap(other);
+  const auto entry = logs().entries.find(log / Logs::kNumbers);
+  if (entry != logs().entries.end()) entry->second[log % Logs::kNumbers].swap(other);
 }
 
 }  // namespace prdp::adjoint_log

@@ -8,8 +8,10 @@
 /// log, passes its number to the solve, and reads the log after the backward pass.
 namespace prdp::adjoint_log {
 
-/// A fresh number, never 0.
+/// A fresh number, never 0. The kSteps numbers that follow are its own as well: those of the steps of a rollout, where
+/// somebody can hold a single log alone, as a compiled graph does.
 int64_t open();
+inline constexpr int64_t kSteps = 1 << 24;
 void close(int64_t log);
 
 /// The report of the last adjoint solve; nothing before the first backward pass, and for unknown numbers.
