@@ -161,10 +161,11 @@ class Stepper(HasSettings):
     def _keep(self, report: Report | None, log: AdjointLog | AdjointLogs, u: Tensor) -> None:
         """Keep the report of what made u. Without gradients, as in a validation, that of the last backward pass
         stays."""
-        if u.requires_grad and self._last_log is not log:
+        compiling = torch.compiler.is_compiling()
+        # A compiled graph would be made again once it finds another kind of log.
+        if u.requires_grad and (compiling or self._last_log is not log):
             self._last_log = log
         kept = None if report is None else outlive_transforms(report)
-        compiling = torch.compiler.is_compiling()
         if kept is None:
             info = None
         else:  # if nothing was solved, way_of_last_solve() would describe an earlier solve
