@@ -84,21 +84,14 @@ bool warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tens
   return true;
 }
 
-/// Warns where zeros take the place of gradients that a NaN or Inf in the cotangent has spoilt: a loss scaler waits for
-/// those, and skips no update. Only what the host has is looked at: nobody waits for a device.
-void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
+/// warn_of_lost_cotangents() of an adjoint solve. Only what the host has is looked at: nobody waits for a device.
+void look_for_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
   if (!role.adjoint || !info.status.is_cpu()) return;
   const auto status = info.status.accessor<int64_t, 1>();
   int64_t lost = 0;
   for (int64_t i = 0; i < status.size(0); ++i)
     lost += static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteInput;
-  if (lost == 0) return;
-  warn_once("cotangents", 0.0, [&](std::ostream& text) {
-    text << name_of(role) << ": the cotangent of " << lost << " of " << status.size(0)
-         << " samples contains NaN or Inf, and their gradient is zero. A GradScaler cannot see that: take bfloat16 "
-            "without one, or a small scale that stays"
-         << in_language(", such as GradScaler(init_scale=256.0, growth_interval=10**9)", "");
-  });
+  if (lost > 0) warn_of_lost_cotangents(name_of(role), lost, status.size(0));
 }
 
 /// Whether max_iter stopped a sample far from its tolerance whose later iterations were in vain: its answer is the
@@ -188,7 +181,7 @@ bool warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor&
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure) {
   if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad)
-    return warn_of_lost_cotangents(role, info);
+    return look_for_lost_cotangents(role, info);
   const int64_t batch = info.status.size(0);
   const auto on_host = info.status.to(at::kCPU);
   const auto* status = on_host.const_data_ptr<int64_t>();
@@ -228,6 +221,15 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   }
   if (failed.size() > named) text << "; and " << failed.size() - named << " more";
   raise_or_warn(text.str(), on_failure);
+}
+
+void warn_of_lost_cotangents(const std::string& who, int64_t lost, int64_t batch) {
+  warn_once("cotangents", 0.0, [&](std::ostream& text) {
+    text << who << ": the cotangent of " << lost << " of " << batch
+         << " samples contains NaN or Inf, and their gradient is zero. A GradScaler cannot see that: take bfloat16 "
+            "without one, or a small scale that stays"
+         << in_language(", such as GradScaler(init_scale=256.0, growth_interval=10**9)", "");
+  });
 }
 
 void warn_of_constant_cycles() {

@@ -21,6 +21,10 @@ struct SolveRole {
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure);
 
+/// Says once that zeros take the place of the gradients of `lost` samples, whose cotangent is not finite: a loss scaler
+/// waits for those, and skips no update. `who` begins the sentence.
+void warn_of_lost_cotangents(const std::string& who, int64_t lost, int64_t batch);
+
 /// Says once that an unrolled gradient of A takes the cycles of multigrid for constants.
 void warn_of_constant_cycles();
 

@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/gpu/device/flow_grid.h"
+#include "prdp/solvers/status.h"
 
 /// The projection of a flow: what comes before and after the solve for the pressure.
 namespace prdp::gpu {
@@ -43,15 +44,16 @@ struct FlowShare {
 };
 
 /// A velocity: base + added, of which the second counts on free faces alone. Either may be absent. Zero in samples that
-/// were refused.
+/// were refused, or whose solve was: its right-hand side is not finite.
 template <class T>
 struct FlowVelocity {
   FlowGrid grid;
   FlowField<const T> base, added, free;
-  const int64_t* refused;  // null: none was
+  const int64_t *refused, *status_of_solve;  // null: none was
 
   T at(int s, int c, const FlowPlace& p) const {
     if (refused && refused[s] != 0) return T(0);
+    if (status_of_solve && status_of_solve[s] == static_cast<int64_t>(SolveStatus::kNonfiniteInput)) return T(0);
     T value = base ? base.at(s, c, p) : T(0);
     if (added) value += free ? added.at(s, c, p) * free.at(s, c, p) : added.at(s, c, p);
     return value;

@@ -8,6 +8,7 @@ namespace prdp {
 class CombinedInfo {
  public:
   void add(const SolveInfo& info) { infos_.push_back(info); }
+  const SolveInfo& last() const { return infos_.back(); }
   /// `refused`, (batch,): 0, or the status of a sample that was refused before; undefined: none was.
   SolveInfo info(const at::Tensor& refused = {}) const;
 

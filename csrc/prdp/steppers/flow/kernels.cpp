@@ -18,7 +18,8 @@ gpu::FlowVelocity<T> velocity_of(const FlowBox& box, const UncorrectedVelocity& 
           .base = field_of<const T>(of.base),
           .added = field_of<const T>(of.added),
           .free = field_of<const T>(box.fields(like.options()).free),
-          .refused = data_of<const int64_t>(of.refused)};
+          .refused = data_of<const int64_t>(of.refused),
+          .status_of_solve = data_of<const int64_t>(of.status_of_solve)};
 }
 
 template <class T>

@@ -29,6 +29,7 @@ struct UncorrectedVelocity {
   FlowParts added = {};         // to which this is added on the free faces; empty: nothing
   at::Tensor potential_bar = {}; // for the reverse: the cotangent of the potential; undefined: none
   at::Tensor refused = {};      // samples whose status is not 0 are zero; undefined: none
+  at::Tensor status_of_solve = {};  // of a correction that is to be zero where the solve had no finite right-hand side
   at::Tensor share_by_nu = {};  // ν, where less than the whole pressure is taken off beyond a largest one
   double largest_nu = 0;
 };
@@ -42,9 +43,9 @@ struct Corrected {
 };
 struct CorrectionOptions {
   double factor;
-  bool on_all_faces = false;       // else on the free ones
+  bool on_all_faces = false;  // else on the free ones
   bool wants_on_free_faces = false;
-  at::Tensor before = {};          // is added to the potential; undefined: nothing
+  at::Tensor before = {};  // is added to the potential; undefined: nothing
 };
 std::optional<Corrected> correct(const FlowBox& box, const UncorrectedVelocity& of, const at::Tensor& found,
                                  const CorrectionOptions& how);

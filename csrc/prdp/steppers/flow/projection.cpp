@@ -98,8 +98,11 @@ std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, co
   if (!b.defined()) return std::nullopt;
   const auto a = pressure_operator(box, b);
   const auto o = for_pressure(box, b, options);
-  const auto found = by.reverse ? counted_adjoint_solve(a, b, {}, o, info).b : counted_solve(a, b, o, info);
-  return flow_kernels::correct(box, by.to_correct, found, by.how);
+  if (!by.reverse) return flow_kernels::correct(box, by.to_correct, counted_solve(a, b, o, info), by.how);
+  const auto found = counted_adjoint_solve(a, b, {}, o, info).b;
+  auto to_correct = by.to_correct;
+  to_correct.status_of_solve = info.last().status;  // the cotangent itself may hold the NaN
+  return flow_kernels::correct(box, to_correct, found, by.how);
 }
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {

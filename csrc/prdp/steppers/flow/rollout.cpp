@@ -1,6 +1,8 @@
 #include "prdp/steppers/flow/rollout.h"
 
 #include "prdp/autograd/detach_failed.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/steppers/flow/cotangents.h"
 #include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/flow/step_node.h"
 #include "prdp/steppers/rollout_loops.h"
@@ -14,7 +16,12 @@ SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, con
                           FlowOutput output = FlowOutput::kNext) {
   const auto step = flow_step(equation, u, options);
   const auto out = output_of(step, output, equation.dt);
-  return {options.on_failure == OnFailure::kZeroGrad ? detach_failed(out, step.info.status) : out, step.info};
+  const auto on_failure = options.on_failure;
+  if (on_failure != OnFailure::kRaise && out.requires_grad())
+    out.register_hook([on_failure](const at::Tensor& cotangent) {
+      return usable_cotangent(cotangent, /*status=*/{}, /*has_pressure=*/true, on_failure).bar;
+    });
+  return {on_failure == OnFailure::kZeroGrad ? detach_failed(out, step.info.status) : out, step.info};
 }
 
 SolveResult one_step(const FlowEquation& equation, const at::Tensor& u, FlowOutput output,
@@ -49,8 +56,16 @@ SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tenso
   if (!is_diffused_with_pressure(equation)) return found;
   const int64_t d = equation.box->dim();
   const auto p = found.u.narrow(1, d, 1);  // φ/Δt of the projection; the pressure is (I - ν Δt L) φ/Δt
-  const auto diffusion = make_operator(diffusion_operators(equation.for_state(u), p).front());  // the same for all
-  found.u = at::cat({found.u.narrow(1, 0, d), diffusion->apply(p)}, 1);
+  auto diffusion = diffusion_operators(equation.for_state(u), p).front();  // the same for all
+  auto& coefficients = diffusion.tensors[0];
+  if (options.on_failure != OnFailure::kRaise && coefficients.requires_grad()) {
+    // A sample whose cotangent is not finite adds nothing to the gradient of ν.
+    auto sizes = coefficients.sizes().vec();
+    sizes[0] = u.size(0);
+    coefficients = coefficients.expand(sizes);
+    coefficients.register_hook([](const at::Tensor& g) { return cleared(g, nonfinite(g).flatten(1).any(1)); });
+  }
+  found.u = at::cat({found.u.narrow(1, 0, d), make_operator(diffusion)->apply(p)}, 1);
   return found;
 }
 

@@ -10,6 +10,7 @@
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/steppers/flow/cotangents.h"
 #include "prdp/steppers/rollout_loops.h"
 
 namespace prdp {
@@ -102,13 +103,16 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   static std::vector<at::Tensor> step_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& status,
                                           const at::Tensor& cotangent, const Call& call, at::IntArrayRef needed) {
     SolveInfo info;
-    FlowCotangent of_step{without_lost_of(cotangent, status, call)};
+    const auto usable =
+        usable_cotangent(cotangent, status, call.output == FlowOutput::kNextAndPressure, call.options.on_failure);
+    FlowCotangent of_step{usable.bar};
     if (call.output == FlowOutput::kNextAndPressure) {
       const int64_t d = u.size(1);
       of_step = {of_step.u.narrow(1, 0, d), of_step.u.narrow(1, d, 1) / equation.dt};
     }
     auto found = flow_step_vjp(equation, u, of_step, call.options, needed, info);
-    if (call.options.adjoint_log != 0 && info.status.defined()) adjoint_log::write(call.options.adjoint_log, info);
+    if (call.options.adjoint_log != 0 && info.status.defined())
+      adjoint_log::write(call.options.adjoint_log, usable.reported(info));
     return found;
   }
 
@@ -123,19 +127,15 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
       std::vector<int64_t> wanted = needed.vec();
       wanted[0] = needed[0] || s > 0;
       SolveInfo info;
-      const auto found = flow_step_vjp(equation, states.select(1, s), {without_lost_of(bar, status_of_step, call)},
-                                       call.options, wanted, info);
+      const auto usable = usable_cotangent(bar, status_of_step, /*has_pressure=*/false, call.options.on_failure);
+      const auto found = flow_step_vjp(equation, states.select(1, s), {usable.bar}, call.options, wanted, info);
       bar = cotangent.select(1, s);
       add_to(bar, found[0]);
       for (size_t i = 1; i < sums.size(); ++i) add_to(sums[i], found[i]);
-      return info;
+      return usable.reported(info);
     });
     if (needed[0]) sums[0] = bar;
     return sums;
-  }
-
-  static at::Tensor without_lost_of(const at::Tensor& cotangent, const at::Tensor& status, const Call& call) {
-    return status.defined() ? without_failed(cotangent, status, call.options.on_failure) : cotangent;
   }
 };
 
