@@ -11,6 +11,7 @@
 #include "prdp/operators/cyclic_reduction.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/remembered.h"
+#include "prdp/operators/saved_outputs.h"
 #include "prdp/operators/separability.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/tensors.h"
@@ -183,6 +184,7 @@ struct Plan : public torch::CustomClassHolder {
   FastSolve fast;
   OperatorSpec a;
   NamedNullSpace null_space;
+  at::Tensor saved_output{};  // within forward()
 };
 
 at::Tensor solve_planned(const Plan& plan, const at::Tensor& coefficients, const at::Tensor& b) {
@@ -201,7 +203,7 @@ class SolveStencil : public torch::autograd::Function<SolveStencil> {
     const auto u = solve_planned(*plan, coefficients, b);
     ctx->save_for_backward({coefficients, u});
     ctx->saved_data["plan"] = c10::IValue::make_capsule(plan);
-    return u;
+    return plan->saved_output = u;
   }
   static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
     const auto plan = c10::static_intrusive_pointer_cast<Plan>(ctx->saved_data["plan"].toCapsule());
@@ -224,7 +226,8 @@ std::optional<at::Tensor> solve_stencil_on_axes(const OperatorSpec& a, const at:
                                                 const NamedNullSpace& null_space) {
   auto fast = find_fast_solve(a, null_space);
   if (!fast.solve || (fast.unsolved.defined() && null_space.vectors > 0)) return std::nullopt;
-  return SolveStencil::apply(a.tensors[0], b, c10::make_intrusive<Plan>(std::move(fast), a, null_space));
+  const auto plan = c10::make_intrusive<Plan>(std::move(fast), a, null_space);
+  return apply_with_saved_output<SolveStencil>(plan->saved_output, a.tensors[0], b, plan);
 }
 
 at::Tensor solve_stencil_directly(const OperatorSpec& a, const at::Tensor& b) {

@@ -7,6 +7,7 @@
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/registered_products.h"
+#include "prdp/operators/saved_outputs.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/steppers/equation_kinds.h"
@@ -24,6 +25,7 @@ struct Call : torch::CustomClassHolder {
   c10::SymInt solves;
   SolveOptions options;
   std::shared_ptr<const RegisteredProducts> products;  // of the preconditioner
+  at::Tensor saved_output{};                           // within forward()
 };
 
 /// Unrolled mode differentiates the iterations, and needs all. Implicit mode needs the solutions alone, and those only
@@ -49,6 +51,7 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     const auto& [solutions, iterations, residual, status, applications, floor] = outputs;
     ctx->mark_non_differentiable({iterations, residual, status, applications, floor});
     ctx->set_materialize_grads(false);
+    call->saved_output = solutions;
     return {solutions, iterations, residual, status, applications, floor};
   }
 
@@ -110,7 +113,7 @@ SolveOutputs record_rollout(const Equation& equation, const at::Tensor& u, const
   call->solves = solves;
   call->options = std::move(options);
   call->products = products_of(call->options.solver.preconditioner.spec());
-  const auto out = RolloutSolves::apply(u, tensors, call);
+  const auto out = apply_with_saved_output<RolloutSolves>(call->saved_output, u, tensors, call);
   return {out[0], out[1], out[2], out[3], out[4], out[5]};
 }
 

@@ -9,6 +9,7 @@
 #include "prdp/error_text.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/registered_products.h"
+#include "prdp/operators/saved_outputs.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/cotangents.h"
 #include "prdp/steppers/rollout_loops.h"
@@ -27,6 +28,7 @@ struct Call : torch::CustomClassHolder {
   FlowOutput output;
   SolveOptions options;
   std::shared_ptr<const RegisteredProducts> products;  // of the preconditioner
+  at::Tensor saved_output{};                           // within forward()
 };
 
 /// The tensors that the backward pass finds again, in this order.
@@ -77,6 +79,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     saved.insert(saved.end(), tensors.begin(), tensors.end());
     ctx->save_for_backward(std::move(saved));
     ctx->saved_data["call"] = c10::IValue::make_capsule(call);
+    if (call->output == FlowOutput::kStates) call->saved_output = out;
     return {out, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
   }
 
@@ -170,7 +173,7 @@ SolveResult flow_steps(const FlowEquation& equation, const at::Tensor& u, int64_
   call->output = output;
   call->options = options;
   call->products = products_of(options.solver.preconditioner.spec());
-  const auto out = FlowSteps::apply(u, at::TensorList(tensors), call);
+  const auto out = apply_with_saved_output<FlowSteps>(call->saved_output, u, at::TensorList(tensors), call);
   return {out[0], {out[1], out[2], out[3], out[4], out[5]}};
 }
 
