@@ -4,6 +4,7 @@ import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 from helpers import field, random, spd_matrices
+from torch.autograd import gradcheck, gradgradcheck
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, linearize, vjp, vmap
 from torch.utils._pytree import tree_leaves
 from transforms import SECOND, SECOND_NAMES, close
@@ -237,3 +238,38 @@ def test_products_have_tangents_in_every_mode():
     step = 1e-6
     ahead, behind = (advection(u + s * v).apply(u + s * v) for s in (step, -step))
     close(moved, (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-8)
+
+
+def products():
+    """Of each kind of operator, of tensors that may require grad."""
+    crow, col = torch.tensor([0, 2, 3, 3]), torch.tensor([2, 0, 1])
+    offsets = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+    v, kappa, shift = random(2, 1, 4, 5), random(1, 4, 5, seed=1).exp(), torch.tensor(0.7, dtype=torch.float64)
+    yield "diffusion", lambda k, s: operators.Diffusion(k, shift=s), (v, kappa, shift)
+    yield "its null space", lambda k: operators.Diffusion(k, boundary="flux"), (v, kappa)
+    yield "of each sample", lambda k: operators.Diffusion(k, shift=1.0), (v, random(2, 4, 5, seed=1).exp())
+    yield "stencil", lambda c: operators.Stencil(c, offsets, "periodic"), (v, random(1, 5, 4, 5, seed=2))
+    yield (
+        "burgers",
+        lambda w, nu: operators.Burgers(w, nu, 0.2),
+        (random(2, 2, 4, 5), random(2, 2, 4, 5, seed=3), shift),
+    )
+    yield "heat", lambda nu: operators.Heat((4, 5), nu, 0.2), (v, shift)
+    yield "dense", operators.Matrix, (random(2, 4), random(4, 4, seed=4))
+    yield "csr", lambda x: operators.Matrix.csr(crow, col, x, 3), (random(2, 3), random(3, seed=5))
+    yield "csr of each", lambda x: operators.Matrix.csr(crow, col, x, (2, 3, 3)), (random(2, 3), random(2, 3, seed=5))
+
+
+@pytest.mark.parametrize(("make", "given"), [case[1:] for case in products()], ids=[case[0] for case in products()])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_a_product_is_one_node_with_both_derivatives(make, given, transposed):
+    def product(v, *tensors):
+        a = make(*tensors)
+        return a.apply_transpose(v) if transposed else a.apply(v)
+
+    inputs = [t.clone().requires_grad_() for t in given]
+    assert gradcheck(product, inputs) and gradgradcheck(product, inputs, fast_mode=True)
+    assert gradcheck(lambda v: product(v, *given[1:]), inputs[:1])  # A alone is constant
+    assert gradcheck(lambda *tensors: product(given[0], *tensors), inputs[1:])  # so is v
+    node = product(*inputs).grad_fn
+    assert {type(edge[0]).__name__ for edge in node.next_functions if edge[0]} == {"AccumulateGrad"}
