@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch
-from helpers import statuses
+from helpers import dense_heat, statuses
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators
@@ -241,3 +241,21 @@ def test_a_kept_kernel_of_diffusion_sees_its_values_change(boundary):
         u, _ = prdp.linear_solve(a, b, prdp.Direct())
         torch.testing.assert_close(u.reshape(2, 30), solved(a.dense(), b))
         kappa.data.mul_(1.7)
+
+
+@pytest.mark.parametrize(("asymmetry", "by_cholesky"), [(0.0, True), (1e-16, True), (1e-9, False)])
+def test_rounding_does_not_hide_that_a_matrix_is_symmetric(asymmetry, by_cholesky):
+    """Sums over elements come out different in the two triangles; Cholesky's method stores half of what LU does."""
+    n = 12
+    exact = torch.from_numpy(dense_heat((n, n)))
+    rounding = torch.triu((exact != 0).double(), 1) * asymmetry * exact.diagonal().max()
+    matrix = (exact + rounding).to_sparse_csr()
+    b = torch.ones(1, n * n, dtype=torch.float64)
+    _C.clear_factorisations()
+    u, info = prdp.linear_solve(matrix, b, prdp.Direct())
+    assert info.solved.all()
+    torch.testing.assert_close(u[0], torch.linalg.solve(matrix.to_dense(), b[0]), rtol=1e-11, atol=0)
+    stored = _C.bytes_of_factorisations()
+    _C.clear_factorisations()
+    prdp.linear_solve(exact.to_sparse_csr(), b, prdp.Direct())
+    assert (stored == _C.bytes_of_factorisations()) == by_cholesky

@@ -47,11 +47,21 @@ bool pivots_exceed(double share, const Eigen::SimplicialLLT<Matrix>& cholesky) {
   return (pivot.array() > share * whole.array()).all();
 }
 
+/// Whether the pattern is symmetric, and the values are up to the rounding of sums that they are assembled from: less
+/// than what Cholesky's method loses of √(a_ii a_jj).
 bool is_symmetric(const Matrix& m) {
   const Matrix t = m.transpose();
-  return std::equal(m.outerIndexPtr(), m.outerIndexPtr() + m.outerSize() + 1, t.outerIndexPtr()) &&
-         std::equal(m.innerIndexPtr(), m.innerIndexPtr() + m.nonZeros(), t.innerIndexPtr()) &&
-         std::equal(m.valuePtr(), m.valuePtr() + m.nonZeros(), t.valuePtr());
+  const bool pattern = std::equal(m.outerIndexPtr(), m.outerIndexPtr() + m.outerSize() + 1, t.outerIndexPtr()) &&
+                       std::equal(m.innerIndexPtr(), m.innerIndexPtr() + m.nonZeros(), t.innerIndexPtr());
+  if (!pattern) return false;
+  if (std::equal(m.valuePtr(), m.valuePtr() + m.nonZeros(), t.valuePtr())) return true;
+  const Eigen::VectorXd root = Eigen::VectorXd(m.diagonal()).cwiseAbs().cwiseSqrt();
+  constexpr double roundings = 8.0 * std::numeric_limits<double>::epsilon();
+  for (Eigen::Index j = 0; j < m.outerSize(); ++j)
+    for (auto k = m.outerIndexPtr()[j]; k < m.outerIndexPtr()[j + 1]; ++k)
+      if (!(std::abs(m.valuePtr()[k] - t.valuePtr()[k]) <= roundings * root[j] * root[m.innerIndexPtr()[k]]))
+        return false;
+  return true;
 }
 
 /// Eigen's ordering and factorisation may not return if a row or a column is empty.
