@@ -116,6 +116,15 @@ std::string not_minimal(const FailedSample& sample) {
   return "A is singular, and b lies outside its range; take a b without that part";
 }
 
+constexpr const char* kLostCoarseGrids =
+    "in float32 its coarse grids may lose what keeps A from being singular; take CG with multigrid, Direct or float64";
+
+bool loses_coarse_grids(const FailedSample& sample) {
+  const auto method = sample.solver().method;
+  return sample.is_single() && sample.is_diffusion() && method != Method::kConjugateGradient &&
+         (method == Method::kMultigrid || sample.preconditioner().is_multigrid());
+}
+
 // One function for each status.
 
 std::string diverged(const FailedSample& sample) {
@@ -124,7 +133,9 @@ std::string diverged(const FailedSample& sample) {
       return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take "
              "GMRES";
     case MadeFor::kDefinite: return "the residual grew beyond ‖b‖: " + not_definite(sample);
-    default: return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct";
+    default:
+      if (loses_coarse_grids(sample)) return c10::str("the residual grew beyond 1e13 ‖b‖: ", kLostCoarseGrids);
+      return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct";
   }
 }
 
@@ -197,11 +208,9 @@ std::string stagnated(const FailedSample& sample) {
 /// Why max_iter left a large residual.
 std::string stopped(const FailedSample& sample) {
   if (auto found = unfit(sample); !found.empty()) return found;
-  const bool single = sample.is_single(), multigrid = sample.preconditioner().is_multigrid();
-  if (multigrid && single && sample.is_diffusion() && sample.solver().method != Method::kConjugateGradient)
-    return "in float32 its coarse grids may lose what keeps A from being singular; take CG with multigrid, Direct or "
-           "float64";
-  if (multigrid)
+  const bool single = sample.is_single();
+  if (loses_coarse_grids(sample)) return kLostCoarseGrids;
+  if (sample.preconditioner().is_multigrid())
     return "its cycles may not be made for this A, as for a wind in central differences that is strong beside the "
            "diffusion; take upwind differences, leave out multigrid, or take Direct";
   if (sample.method().is_direct)
@@ -224,7 +233,8 @@ const char* zero_on_diagonal(const FailedSample& sample) {
 
 std::string zero_diagonal(const FailedSample& sample) {
   const auto made_for = sample.method().made_for;
-  const bool takes_any_diagonal = made_for == MadeFor::kAny || made_for == MadeFor::kSymmetric;
+  const bool takes_any_diagonal =
+      made_for == MadeFor::kAny || (made_for == MadeFor::kSymmetric && asymmetric(sample).empty());
   const bool is_to_blame = sample.preconditioner().is_diagonal() && takes_any_diagonal;
   return c10::str(zero_on_diagonal(sample), "; take ", is_to_blame ? sample.method().label : "GMRES",
                   is_to_blame ? " without it" : "");
