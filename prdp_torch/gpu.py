@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from prdp_torch import _C
+from prdp_torch import _C, _check
 from prdp_torch.torch_private import leaves_of
 
 
@@ -27,6 +27,7 @@ def warm_up(step: Callable[[Tensor], Any], example: Tensor, backward: bool = Tru
         The kernels that were made, such as "CG of Stencil<float, Grid<1, 64, 64>, …>"; none on the CPU, and none that
         this process had made before.
     """
+    _check.dense("warm_up", "example", example)
     before = set(_C.kernels_made())
     state = example.detach().clone().requires_grad_(backward)
     with torch.enable_grad() if backward else torch.no_grad():

@@ -55,6 +55,10 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
     A = as_operator(who, "A", A)
     if _check.dense(who, "example", example).dim() < 2:
         raise ValueError(f"{who}: example must have shape (batch, ...), got {tuple(example.shape)}")
+    if not example.is_floating_point():
+        raise TypeError(f"{who}: example must be float32 or float64, got {example.dtype}")
+    if solver is not None and not isinstance(solver, Solver):
+        raise TypeError(f"{who}: solver must be a Solver such as CG(10), got {_check.shown(solver)}")
     A, example = A.of(map(full_precision, A.tensors)), full_precision(example)
     generator = Generator().manual_seed(0)
     v, w = (_noise(example, generator) for _ in range(2))

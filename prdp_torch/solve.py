@@ -163,10 +163,13 @@ def detach_failed(u: Tensor, info: SolveInfo) -> Tensor:
 
     Raises:
         ValueError: u and info differ in their batch or their steps.
+        TypeError: info is no `SolveInfo`: a step has none before its first call.
 
     Examples:
         >>> loss = (network(prdp.detach_failed(step(u), step.info)) - reference).square().mean()
     """
+    if not isinstance(info, SolveInfo):
+        raise TypeError(f"detach_failed: info must be the SolveInfo of the solve that made u, got {info!r:.80}")
     constant: Tensor = torch.ops.prdp.detach_failed(u, info.status)
     return constant
 

@@ -88,11 +88,13 @@ class Operator:
     def apply(self, v: Tensor) -> Tensor:
         """Return A v, with gradients. v has the shape of a right-hand side. Where a null space is named, the product is
         without its part along the left one, also if that is wrong."""
+        self._check_vector("apply", v)
         product: Tensor = torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
         return product
 
     def apply_transpose(self, v: Tensor) -> Tensor:
         """Return Aᵀ v, with gradients."""
+        self._check_vector("apply_transpose", v)
         product: Tensor = torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, True)
         return product
 
@@ -105,9 +107,18 @@ class Operator:
         """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples, in float64 unless `dtype` says
         otherwise; with a null space that is named, the matrix of `apply`. Only for small n: ValueError if it would not
         fit into the memory of the machine."""
+        self._check_dense_dtype(dtype)
         self._check_dense_fits(dtype)
         matrix: Tensor = torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
         return matrix
+
+    def _check_dense_dtype(self, dtype: object) -> None:
+        if dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"{type(self).__name__}.dense: dtype must be torch.float32 or torch.float64, got {dtype!r}")
+
+    def _check_vector(self, name: str, v: object) -> None:
+        if not torch.compiler.is_compiling():
+            _check.dense(f"{type(self).__name__}.{name}", "v", v)
 
     def _unknowns(self) -> int:
         """The length of a vector, in all its channels."""
@@ -199,6 +210,6 @@ def _names_of(right: Tensor, left: Tensor) -> list[str | None]:
 def _basis(who: str, name: str, value: NullSpace, like: Tensor | None) -> Tensor:
     if isinstance(value, str) and value == "constant":
         return torch.empty(0) if like is None else like.new_empty(0)
-    if not isinstance(value, Tensor):
+    if not isinstance(value, Tensor) or value.dim() == 0:
         raise TypeError(f"{who}: {name} must be None, 'constant' or a tensor (k, *shape), got {value!r:.80}")
     return _check.dense(who, name, value)

@@ -58,8 +58,7 @@ class Matrix(Operator):
 
     def dense(self, dtype: torch.dtype = torch.float64) -> Tensor:
         """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples."""
-        if dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"Matrix.dense: dtype must be torch.float32 or torch.float64, got {dtype}")
+        self._check_dense_dtype(dtype)
         converted = self.of([t.to(dtype) if t.is_floating_point() else t for t in self.tensors])
         return Operator.dense(converted, dtype)
 

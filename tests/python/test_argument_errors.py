@@ -202,6 +202,22 @@ CSR = (torch.arange(4), torch.arange(3), torch.ones(3))
      "operators.Function(matvec)"),
     (lambda: prdp.ToleranceController().step(torch.tensor(1j)), TypeError, "error must be a real number, got 1j"),
     (lambda: prdp.PRDPController().step(-0.9), ValueError, "got -0.9; smaller is better, as in 1 - accuracy"),
+    (lambda: operators.Matrix(torch.eye(3), nullspace=torch.tensor(1.0)), TypeError,
+     "Matrix: nullspace must be None, 'constant' or a tensor (k, *shape), got tensor(1.)"),
+    (lambda: prdp.detach_failed(torch.ones(1, 3), heat().info), TypeError,
+     "detach_failed: info must be the SolveInfo of the solve that made u, got None"),
+    (lambda: prdp.check_operator(torch.eye(3), torch.ones(1, 3), "cg"), TypeError,
+     "check_operator: solver must be a Solver such as CG(10), got 'cg'"),
+    (lambda: prdp.check_operator(torch.eye(3), torch.ones(1, 3, dtype=torch.int64)), TypeError,
+     "check_operator: example must be float32 or float64, got torch.int64"),
+    (lambda: operators.Poisson((3,)).dense("float64"), TypeError,
+     "Poisson.dense: dtype must be torch.float32 or torch.float64, got 'float64'"),
+    (lambda: operators.Poisson((3,)).apply(None), TypeError, "Poisson.apply: v must be a torch tensor, got NoneType"),
+    (lambda: prdp.warm_up(heat(), None), TypeError, "warm_up: example must be a torch tensor, got NoneType"),
+    (lambda: prdp.linear_solve(torch.eye(3).repeat(2, 1, 1), torch.ones(2, 4, 3), prdp.Direct()), ValueError,
+     "got [2, 4, 3]; for several right-hand sides of a matrix, take torch.func.vmap over them"),
+    (lambda: prdp.linear_solve(torch.eye(3).repeat(2, 1, 1), torch.ones(3), prdp.Direct()), ValueError,
+     "A holds 2 matrices, b holds 1 right-hand side; expand b, so that each has its own"),
 ])  # fmt: skip
 def test_what_strangers_tried(call, error, said):
     with pytest.raises(error, match=re.escape(said)):
