@@ -6,6 +6,7 @@
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/kept_hierarchy.h"
+#include "prdp/solvers/report_failures.h"
 
 namespace prdp {
 
@@ -19,6 +20,8 @@ SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
       products_(products_of(a_)),
       products_of_inverse_(products_of(options_.solver.preconditioner.spec())) {
   if (options_.backward == Backward::kImplicit && is_plain(b)) gpu::share_hierarchy(options_, b);
+  if (options_.backward == Backward::kUnrolled && any_requires_grad(options_.solver.preconditioner.spec().tensors))
+    warn_of_constant_preconditioner();
 }
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {

@@ -232,6 +232,14 @@ void warn_of_lost_cotangents(const std::string& who, int64_t lost, int64_t batch
   });
 }
 
+void warn_of_constant_preconditioner() {
+  warn_once("constant preconditioner", 0.0, [](std::ostream& text) {
+    text << "linear_solve: the tensors of the preconditioner require grad and get none: in unrolled mode, too, it "
+            "counts "
+            "as a constant; detach them if this is meant";
+  });
+}
+
 void warn_of_constant_cycles() {
   warn_once("constant cycles", 0.0, [](std::ostream& text) {
     text << in_language("backward=\"unrolled\"", "Backward::kUnrolled")

@@ -28,6 +28,9 @@ void warn_of_lost_cotangents(const std::string& who, int64_t lost, int64_t batch
 /// Says once that an unrolled gradient of A takes the cycles of multigrid for constants.
 void warn_of_constant_cycles();
 
+/// Says once that the tensors of a preconditioner get no gradient.
+void warn_of_constant_preconditioner();
+
 /// Warns that ⟨λ, b⟩ and ⟨u, ū⟩ of a sample differ, so that a Function's adjoint solve was made with another A: once
 /// for this `code`.
 void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_solve, double of_adjoint);

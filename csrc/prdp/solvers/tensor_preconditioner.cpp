@@ -1,13 +1,17 @@
 #include "prdp/solvers/tensor_preconditioner.h"
 
+#include <ATen/core/grad_mode.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/custom_class.h>
 
 #include <limits>
 #include <memory>
 
+#include "prdp/error_text.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/preconditioner.h"
+#include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/solvers/solve_on_gpu.h"
 
 namespace prdp {
@@ -17,13 +21,13 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
-/// V-cycles of every sample of a batch: M⁻¹ v, or M⁻ᵀ v.
-class Cycles : public torch::CustomClassHolder {
+/// M⁻¹ v, or M⁻ᵀ v, of every sample of a batch.
+class Inverse : public torch::CustomClassHolder {
  public:
   virtual at::Tensor apply(const at::Tensor& v, bool transposed) = 0;
 };
 
-class CyclesOnGpu final : public Cycles {
+class CyclesOnGpu final : public Inverse {
  public:
   CyclesOnGpu(gpu::Product product, gpu::Product transpose)
       : product_(std::move(product)), transpose_(std::move(transpose)) {}
@@ -35,7 +39,7 @@ class CyclesOnGpu final : public Cycles {
 
 /// On the CPU; vectors of other devices are copied there and back.
 template <class T>
-class CyclesOnLoops final : public Cycles {
+class CyclesOnLoops final : public Inverse {
  public:
   CyclesOnLoops(std::shared_ptr<const kernels::Kernels> a, std::shared_ptr<const kernels::Kernels> transpose,
                 int64_t smoothing, int64_t batch)
@@ -79,22 +83,22 @@ class CyclesOnLoops final : public Cycles {
   kernels::Workspace<T> workspace_;
 };
 
-/// M⁻¹ v, or M⁻ᵀ v. It is linear in v, so its derivative is the transpose.
-class ApplyCycles : public torch::autograd::Function<ApplyCycles> {
+/// It is linear in v, so its derivative is the transpose.
+class ApplyInverse : public torch::autograd::Function<ApplyInverse> {
  public:
-  static at::Tensor forward(AutogradContext* ctx, const at::Tensor& v, const c10::intrusive_ptr<Cycles>& cycles,
+  static at::Tensor forward(AutogradContext* ctx, const at::Tensor& v, const c10::intrusive_ptr<Inverse>& inverse,
                             bool transposed) {
-    ctx->saved_data["cycles"] = c10::IValue::make_capsule(cycles);
+    ctx->saved_data["inverse"] = c10::IValue::make_capsule(inverse);
     ctx->saved_data["transposed"] = transposed;
-    return cycles->apply(v, transposed);
+    return inverse->apply(v.detach(), transposed);
   }
   static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
-    const auto cycles = c10::static_intrusive_pointer_cast<Cycles>(ctx->saved_data["cycles"].toCapsule());
-    return {ApplyCycles::apply(grads[0], cycles, !ctx->saved_data["transposed"].toBool()), {}, {}};
+    const auto inverse = c10::static_intrusive_pointer_cast<Inverse>(ctx->saved_data["inverse"].toCapsule());
+    return {ApplyInverse::apply(grads[0], inverse, !ctx->saved_data["transposed"].toBool()), {}, {}};
   }
 };
 
-c10::intrusive_ptr<Cycles> make_cycles(const Operator& a, const Preconditioner& m, const at::Tensor& b) {
+c10::intrusive_ptr<Inverse> make_cycles(const Operator& a, const Preconditioner& m, const at::Tensor& b) {
   if (auto product = gpu::make_cycle(a, /*transposed=*/false, m, b))
     if (auto transpose = gpu::make_cycle(a, /*transposed=*/true, m, b))
       return c10::make_intrusive<CyclesOnGpu>(std::move(product), std::move(transpose));
@@ -117,17 +121,42 @@ auto in_its_name(const Call& call) {
   }
 }
 
+/// A function of the user's own with a transpose: neither needs to be made of operations that autograd sees.
+class OwnInverse final : public Inverse {
+ public:
+  explicit OwnInverse(std::shared_ptr<Operator> of) : of_(std::move(of)) {}
+  at::Tensor apply(const at::Tensor& v, bool transposed) override {
+    return in_its_name([&] { return transposed ? of_->apply_transpose(v) : of_->apply(v); });
+  }
+
+ private:
+  std::shared_ptr<Operator> of_;
+};
+
 }  // namespace
 
 TensorPreconditioner make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b) {
   if (preconditioner.is_operator()) {
     const std::shared_ptr<Operator> inverse = make_operator(preconditioner.spec());
     in_its_name([&] { inverse->check_vector(b); });
-    return [inverse](const at::Tensor& v) { return in_its_name([&] { return inverse->apply(v); }); };
+    const auto products = products_of(preconditioner.spec());
+    const auto own = products && products->products().apply_transpose ? c10::make_intrusive<OwnInverse>(inverse)
+                                                                      : c10::intrusive_ptr<OwnInverse>();
+    const bool is_own = products != nullptr;
+    return [inverse, own, is_own](const at::Tensor& v) {
+      const bool recorded = at::GradMode::is_enabled() && v.requires_grad();
+      if (own && recorded && !in_torch_func() && !has_tangent(v)) return ApplyInverse::apply(v, own, false);
+      const auto found = in_its_name([&] { return inverse->apply(v); });
+      TORCH_CHECK_VALUE(!recorded || !is_own || found.requires_grad(),
+                        "preconditioner: autograd does not see how its product depends on the vector, as after ",
+                        in_language("detach() or numpy()", "detach()"),
+                        ", and unrolled mode differentiates it; give its transpose, or say that it is symmetric");
+      return found;
+    };
   }
   if (!preconditioner.is_multigrid()) return {};
   return [cycles = make_cycles(a, preconditioner, b.detach())](const at::Tensor& v) {
-    return ApplyCycles::apply(v, cycles, /*transposed=*/false);
+    return ApplyInverse::apply(v, cycles, /*transposed=*/false);
   };
 }
 
