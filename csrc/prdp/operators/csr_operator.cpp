@@ -2,6 +2,8 @@
 
 #include <ATen/TensorSubclassLikeUtils.h>
 
+#include <algorithm>
+
 #include "prdp/gpu/operator_view.h"
 #include "prdp/gpu/part_of.h"
 #include "prdp/kernels/matrix.h"
@@ -86,8 +88,18 @@ void CsrOperator::check_vector(const at::Tensor& b) const { check_matrix_vector(
 
 at::Tensor CsrOperator::rows() const {
   if (rows_.defined()) return rows_;
+  const int64_t stored = values_.size(-1);
+  if (crow_.is_cpu() && crow_.dim() == 1 && is_plain(crow_)) {
+    rows_ = at::empty({stored}, crow_.options());
+    const auto crow = crow_.contiguous();
+    const auto* ends = crow.const_data_ptr<int64_t>() + 1;
+    auto* row = rows_.mutable_data_ptr<int64_t>();
+    for (int64_t i = 0, k = 0; i < n(); ++i)
+      for (; k < std::min(ends[i], stored); ++k) row[k] = i;
+    return rows_;
+  }
   // Row of each stored entry: how many row ends lie at or before its position.
-  const auto position = at::arange(values_.size(-1), crow_.options());
+  const auto position = at::arange(stored, crow_.options());
   const auto ends = crow_.narrow(-1, 1, n()).contiguous();
   const auto wanted = values_.dim() == 2 ? position.expand_as(col_).contiguous() : position;
   return rows_ = at::searchsorted(ends, wanted, /*out_int32=*/false, /*right=*/true);
@@ -206,14 +218,29 @@ std::shared_ptr<const kernels::Kernels> CsrOperator::kernels(const at::Tensor& b
                            a = values_.detach().contiguous()]<class T>(T) -> kernels::KernelBatch<T> {
     const int64_t stored = a.size(-1);
     const bool own = a.dim() == 2 && a.size(0) > 1;
-    return {!own, [=](int64_t s) -> std::unique_ptr<kernels::Kernel<T>> {
-              const T* values = a.template const_data_ptr<T>() + own * s * stored;
-              const T magnitude = kernels::largest_magnitude(values, stored);
-              if (!std::isfinite(magnitude)) return nullptr;
-              return std::make_unique<kernels::Csr<T>>(crow.template const_data_ptr<int64_t>() + own * s * (n + 1),
-                                                       col.template const_data_ptr<int64_t>() + own * s * stored,
-                                                       values, n, transposed, magnitude);
-            }};
+    const auto product = [=](int64_t s, const T* v, T* out) {
+      const int64_t* rows = crow.template const_data_ptr<int64_t>() + own * s * (n + 1);
+      const int64_t* columns = col.template const_data_ptr<int64_t>() + own * s * stored;
+      const T* values = a.template const_data_ptr<T>() + own * s * stored;
+      if (transposed) std::fill_n(out, n, T(0));
+      for (int64_t i = 0; i < n; ++i) {
+        T sum = 0;
+        for (int64_t k = rows[i]; k < rows[i + 1]; ++k) {
+          if (transposed) out[columns[k]] += values[k] * v[i];
+          else sum += values[k] * v[columns[k]];
+        }
+        if (!transposed) out[i] = sum;
+      }
+    };
+    const auto make = [=](int64_t s) -> std::unique_ptr<kernels::Kernel<T>> {
+      const T* values = a.template const_data_ptr<T>() + own * s * stored;
+      const T magnitude = kernels::largest_magnitude(values, stored);
+      if (!std::isfinite(magnitude)) return nullptr;
+      return std::make_unique<kernels::Csr<T>>(crow.template const_data_ptr<int64_t>() + own * s * (n + 1),
+                                               col.template const_data_ptr<int64_t>() + own * s * stored, values, n,
+                                               transposed, magnitude);
+    };
+    return {!own, make, product};
   };
   return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
 }
