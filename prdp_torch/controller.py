@@ -8,7 +8,7 @@ from torch import Tensor
 
 from prdp_torch import _C, _check, data_parallel
 from prdp_torch.calls import between_graphs
-from prdp_torch.controller_interval import Ended, Interval
+from prdp_torch.controller_interval import Ended, Interval, all_converged
 from prdp_torch.controller_records import PRDPSettings, Record, ToleranceRecord, ToleranceSettings
 from prdp_torch.types import Number, Refinable, Steppers
 
@@ -74,7 +74,7 @@ class _Attached(_Compiled):
     def _decide(self, metric: float, converged: bool | None, error: float | None) -> bool:
         """One step of the compiled controller, and what follows from it for the steppers."""
         if converged is None:
-            converged = bool(self.steppers) and all(getattr(s, "converged", None) is True for s in self.steppers)
+            converged = all_converged(self.steppers)
         ended = Ended.of(self.steppers)
         refined = self._step(*Interval.of_processes(metric, bool(converged), error, ended, self.process_group))
         self._push()

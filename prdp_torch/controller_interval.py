@@ -1,7 +1,7 @@
 """What controllers decide by after an interval: how its solves ended, and numbers that all processes agree on."""
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeGuard
 
 import torch
 
@@ -11,6 +11,15 @@ from prdp_torch.types import Refinable
 
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
+
+
+def all_converged(steppers: list[Refinable]) -> bool:
+    """Whether all say so, by a bool of any library: a method, or a value for each sample, is none."""
+    said = [getattr(stepper, "converged", None) for stepper in steppers]
+    return bool(said) and all((isinstance(x, int) or getattr(x, "shape", None) == ()) and bool(x) for x in said)
+
+
+_READ = ("residual", "floor", "iterations", "status")
 
 
 class Ended(NamedTuple):
@@ -23,7 +32,7 @@ class Ended(NamedTuple):
     def of(cls, steppers: list[Refinable]) -> Self:
         residuals, idle = [], [0.0]
         for info in (getattr(stepper, "info", None) for stepper in steppers):
-            if not isinstance(info, SolveInfo):  # it has not solved yet, or is of somebody else's kind
+            if not _is_report(info):  # it has not solved yet, or is of somebody else's kind
                 residuals.append((0.0, 0.0))
                 continue
             parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations, info.status)])
@@ -34,6 +43,10 @@ class Ended(NamedTuple):
             is_idle = ((iterations == 0) & (status > 0) & (residual > _C.SMALL_RESIDUAL)).double()  # K may be 0
             idle.append(float(is_idle.mean()) if is_idle.numel() else 0.0)
         return cls(residuals, max(idle))
+
+
+def _is_report(info: Any) -> TypeGuard[SolveInfo]:
+    return all(isinstance(getattr(info, name, None), torch.Tensor) for name in _READ)
 
 
 class Interval(NamedTuple):

@@ -157,3 +157,17 @@ class HearsOfMoves(torch.nn.Module):
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self._moved(fn)
         return self
+
+
+def is_made_by(t: Tensor, node: str) -> bool:
+    """Whether a node of this name is in the graph of t. Its name is torch's own."""
+    seen, nodes = set(), [t.grad_fn]
+    while nodes:
+        here = nodes.pop()
+        if here is None or here in seen:
+            continue
+        if here.name() == node:
+            return True
+        seen.add(here)
+        nodes += [before for before, _ in here.next_functions]
+    return False

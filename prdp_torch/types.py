@@ -49,7 +49,7 @@ class StepOptions(TypedDict, total=False):
 class Refinable(Protocol):
     """What a controller refines: a stepper, or anything else with a `max_iter`, which may be a property whose setter
     turns several knobs. A `ToleranceController` also sets `rtol`, `adjoint_rtol` and `adjoint_max_iter`. A controller
-    reads `converged` where it is a bool, and `info` where it is a `SolveInfo`."""
+    reads `converged` where it is a bool, and `info` where it has the tensors of a `SolveInfo`."""
 
     @property
     def max_iter(self) -> int: ...

@@ -124,6 +124,8 @@ class Matrix(Operator):
 def _has_sorted_columns(crow: Tensor, col: Tensor) -> bool:
     """Whether the columns of each row increase, (n + 1,) and (nnz,) or a batch of them."""
     n = crow.shape[-1] - 1
+    if col.is_meta or col.numel() == 0:
+        return True
     for pointers, columns in zip(crow.view(-1, n + 1), col.view(-1, col.shape[-1]), strict=True):
         rows = torch.arange(n, device=crow.device).repeat_interleave(pointers.diff())
         if not bool(((rows * n + columns).diff() > 0).all()):
@@ -139,7 +141,8 @@ def _check_csr_gradient(matrix: Tensor, crow: Tensor, col: Tensor) -> None:
     global _warned_of_csr_gradient
     if not matrix.requires_grad or not torch.is_grad_enabled() or torch.compiler.is_compiling():
         return
-    if matrix.grad_fn is not None and not _has_sorted_columns(crow, col):
+    # Of a CSR tensor that is a leaf, torch gets it right, and of what is computed from it.
+    if not _has_sorted_columns(crow, col) and torch_private.is_made_by(matrix, "SparseCompressedTensorBackward0"):
         raise ValueError(
             "linear_solve: torch gives the gradient of this sparse CSR tensor to the wrong values, as the columns of a "
             "row are not sorted, or repeat; take operators.Matrix.csr(crow, col, values, size), or sort them"

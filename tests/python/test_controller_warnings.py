@@ -3,6 +3,7 @@
 import importlib
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from helpers import field, heat_step
@@ -131,8 +132,9 @@ def test_names_that_mean_something_else_are_not_read(attributes):
     assert solver.max_iter == controller.max_iter == 2
 
 
-def test_a_bool_is_believed():
-    solver = Foreign(converged=True)
+@pytest.mark.parametrize("yes", [True, 1, torch.tensor(True), np.bool_(True)])
+def test_a_bool_of_any_library_is_believed(yes):
+    solver = Foreign(converged=yes)
     controller = prdp.PRDPController([solver], window=1, delta=2)
     for _ in range(5):
         controller.step(1.0)

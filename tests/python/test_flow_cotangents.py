@@ -81,11 +81,11 @@ def test_second_derivatives_leave_it_out_as_well():
     assert found[0][0].abs().max() > 0 and torch.equal(*found)
 
 
-@pytest.mark.filterwarnings("ignore:.*their gradient is zero")
-@pytest.mark.parametrize("name", ["periodic", "explicit, upwind", "channel"])
-def test_unrolled_solves_leave_it_out_as_well(name):
-    found, _ = gradients(name, "loops", True, False, backward="unrolled", on_failure="return")
-    expected, _ = gradients(name, "loops", False, False, backward="unrolled", on_failure="return")
-    assert (found[0][1] == 0).all()
-    for mine, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-11)
+def test_many_cotangents_at_once():
+    u = noise(2, 2, *CASES["periodic"][0])
+    nu = torch.tensor(0.02, dtype=F64, requires_grad=True)
+    pressure = flow("periodic", nu=nu, on_failure="return").step_and_pressure(u)[1]
+    weights = noise(3, *pressure.shape, seed=1)
+    (found,) = torch.autograd.grad(pressure, nu, weights, is_grads_batched=True, retain_graph=True)
+    each = [torch.autograd.grad(pressure, nu, w, retain_graph=True)[0] for w in weights]
+    torch.testing.assert_close(found, torch.stack(each), rtol=1e-10, atol=0)

@@ -44,7 +44,9 @@ def test_without_a_transpose_it_is_refused_where_it_would_be_differentiated():
     hidden = operators.Function(lambda r: torch.from_numpy(r.detach().numpy() @ SKEWED.T))
     b = random(2, N, seed=1).requires_grad_()
     solver = prdp.GMRES(2, rtol=0.0, restart=3, preconditioner=hidden)
-    with pytest.raises(ValueError, match=r"preconditioner: autograd does not see .* give its transpose, or say that it"):
+    with pytest.raises(
+        ValueError, match=r"preconditioner: autograd does not see .* give its transpose, or say that it"
+    ):
         prdp.linear_solve(A, b, solver, backward="unrolled")[0].sum().backward()
 
 

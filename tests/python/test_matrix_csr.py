@@ -137,3 +137,25 @@ def test_torchs_wrong_gradient_of_unsorted_columns_is_refused(columns, right):
             operators.Matrix(batch)
     with torch.no_grad():  # without a gradient nothing is wrong
         torch.testing.assert_close(prdp.linear_solve(matrix, b, prdp.Direct())[0][0], torch.linalg.solve(exact, b[0]))
+
+
+@pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor", "ignore:Sparse")
+def test_unsorted_columns_of_a_leaf_have_a_right_gradient():
+    matrix = torch.sparse_csr_tensor(
+        torch.tensor([0, 2, 4]), torch.tensor([1, 0, 1, 0]), torch.tensor([1.0, 4.0, 5.0, 2.0]).double(), (2, 2)
+    ).requires_grad_()
+    b, w = torch.tensor([[1.0, 2.0]]).double(), torch.tensor([1.0, 3.0]).double()
+    (prdp.linear_solve(matrix * 2.0, b, prdp.Direct())[0] * w).sum().backward()
+    dense = matrix.detach().to_dense().requires_grad_()
+    (torch.linalg.solve(2.0 * dense, b[0]) * w).sum().backward()
+    torch.testing.assert_close(matrix.grad.to_dense(), dense.grad)
+
+
+@pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor", "ignore:Sparse")
+def test_a_matrix_without_entries_and_one_without_memory_are_looked_at_as_well():
+    values = torch.zeros(0, requires_grad=True)
+    nothing = torch.sparse_csr_tensor(torch.zeros(3).long(), torch.zeros(0).long(), values, (2, 2))
+    assert operators.Matrix(nothing).apply(torch.ones(1, 2)).eq(0).all()
+    pattern = torch.tensor([0, 2, 4], device="meta"), torch.tensor([1, 0, 1, 0], device="meta")
+    on_meta = torch.sparse_csr_tensor(*pattern, torch.ones(4, device="meta", requires_grad=True), (2, 2))
+    assert operators.Matrix(on_meta).kind == "csr"

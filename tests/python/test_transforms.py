@@ -262,14 +262,58 @@ def products():
 
 @pytest.mark.parametrize(("make", "given"), [case[1:] for case in products()], ids=[case[0] for case in products()])
 @pytest.mark.parametrize("transposed", [False, True])
-def test_a_product_is_one_node_with_both_derivatives(make, given, transposed):
+def test_products_have_both_derivatives(make, given, transposed):
     def product(v, *tensors):
         a = make(*tensors)
         return a.apply_transpose(v) if transposed else a.apply(v)
 
+    def of_constant(v):
+        return product(v, *given[1:])
+
     inputs = [t.clone().requires_grad_() for t in given]
-    assert gradcheck(product, inputs) and gradgradcheck(product, inputs, fast_mode=True)
-    assert gradcheck(lambda v: product(v, *given[1:]), inputs[:1])  # A alone is constant
-    assert gradcheck(lambda *tensors: product(given[0], *tensors), inputs[1:])  # so is v
-    node = product(*inputs).grad_fn
-    assert {type(edge[0]).__name__ for edge in node.next_functions if edge[0]} == {"AccumulateGrad"}
+    forward_over_reverse = not product(*inputs).is_sparse and given[1].dim() > 0
+    assert gradcheck(product, inputs)
+    assert gradgradcheck(product, inputs, fast_mode=True, check_fwd_over_rev=forward_over_reverse)
+    assert gradcheck(of_constant, inputs[:1], check_forward_ad=True)
+    assert gradgradcheck(of_constant, inputs[:1], fast_mode=True)
+    assert gradcheck(lambda *tensors: product(given[0], *tensors), inputs[1:])  # v is constant
+    before = of_constant(inputs[0]).grad_fn.next_functions  # one node
+    assert {type(node).__name__ for node, _ in before if node} == {"AccumulateGrad"}
+
+
+def nested():
+    """Products whose operator and vector depend on the same tensor, and the tensor."""
+    v, kappa = random(2, 1, 6, seed=1), random(1, 6, seed=2).exp()
+
+    def twice(k):
+        a = operators.Diffusion(k, shift=1.0)
+        return a.apply(a.apply(v))
+
+    yield "twice", twice, kappa
+    yield "of its own", lambda u: operators.Burgers(u, 0.1, 0.1).apply(u), v
+    yield "explicit", lambda u: 2 * u - operators.Burgers(u, 0.1, 0.1).apply(u), v
+    yield "of each other", lambda k: operators.Diffusion(k, shift=k.mean()).apply(v), kappa
+    yield "of a constant", lambda u: operators.Heat((6,), 0.1, 0.1).apply(operators.Heat((6,), 0.2, 0.1).apply(u)), v
+
+
+@pytest.mark.parametrize(("function", "at"), [case[1:] for case in nested()], ids=[case[0] for case in nested()])
+def test_a_recorded_gradient_of_products_is_the_gradient(function, at):
+    leaf = at.clone().requires_grad_()
+    found = [
+        torch.autograd.grad(function(leaf).square().sum(), leaf, create_graph=recorded)[0] for recorded in (False, True)
+    ]
+    torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-12)
+    close(grad(lambda x: function(x).square().sum())(at), found[0])
+    assert gradgradcheck(lambda x: function(x).square().sum(), leaf)
+
+
+def test_a_product_with_a_constant_takes_what_inference_mode_made():
+    with torch.inference_mode():
+        kappa = torch.ones(1, 8, dtype=torch.float64)
+        a = operators.Diffusion(kappa, shift=1.0)
+    v = random(2, 1, 8).requires_grad_()
+    a.apply(v).sum().backward()
+    close(v.grad, operators.Diffusion(torch.ones(1, 8).double(), shift=1.0).apply(torch.ones_like(v)))
+    product = operators.Poisson((8,)).apply(v).sum()
+    product.backward(retain_graph=True)
+    product.backward()

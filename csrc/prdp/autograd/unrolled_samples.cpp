@@ -192,10 +192,9 @@ class SampleVjps {
     found_ = differentiate(found_.finite);
   }
 
-  /// Whether samples share a tensor of A, so that its gradient is a sum over them, and can be taken out of the batch: a
-  /// function and a preconditioner of the user's own see all of it.
+  /// Whether samples share a tensor of A, so that its gradient is a sum over them, of which their shares are known.
   bool can_be_alone() const {
-    if (batch_ == 1 || is_function(spec_) || options_.solver.preconditioner.is_operator()) return false;
+    if (batch_ == 1 || of_samples_.empty()) return false;
     for (size_t k = 0; k < spec_.tensors.size(); ++k)
       if (needed_[k + 1] && !is_of_samples(spec_, k, batch_)) return true;
     return false;
@@ -203,21 +202,14 @@ class SampleVjps {
   /// Those whose Ā misleads, each judged by its own, so that its neighbours do not decide what it gets.
   Rows misleading_alone(const Rows& rows, const std::vector<double>& allowed) {
     Rows misleading(batch_);
-    const auto caps = solved_.iterations.to(at::kLong);
     for (int64_t i = 0; i < batch_; ++i) {
       if (!rows[i]) continue;
       const auto one = [&](const at::Tensor& t) { return t.defined() ? t.narrow(0, i, 1) : t; };
       auto a = spec_;
       for (size_t k = 0; k < a.tensors.size(); ++k)
         if (is_of_samples(spec_, k, batch_)) a.tensors[k] = one(a.tensors[k]);
-      std::vector<at::Tensor> found;
-      if (!of_samples_.empty()) {
-        found = of_samples_[i];
-        found.insert(found.begin(), one(found_.gradients[0]));
-      } else {
-        const UnrolledSolve solve{a, one(solved_.x0), options_.solver, one(caps), options_.checkpoint_every};
-        found = of_iterations_(one(finite_cotangent_), one(solved_.b), solve, wanted_).gradients;
-      }
+      auto found = of_samples_[i];
+      found.insert(found.begin(), one(found_.gradients[0]));
       misleading[i] =
           found[0].defined() && misleading_a_bar(a, found, one(solution()).detach(), needed_, {true}, {allowed[i]})[0];
     }

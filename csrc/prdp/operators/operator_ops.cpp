@@ -26,50 +26,35 @@ OperatorSpec spec(at::TensorList tensors, c10::string_view kind, at::IntArrayRef
   return {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed};
 }
 
-/// A v by the loops, as one node: recorded in tensor operations it would take ten times as long, and keep what each of
-/// them does.
+/// A v by the loops, as one node, where A is constant: recorded in tensor operations it would take ten times as long,
+/// and keep what each of them does. Its derivative is Aᵀ.
 class Product : public torch::autograd::Function<Product> {
  public:
-  static at::Tensor forward(AutogradContext* ctx, const at::Tensor& v, at::TensorList tensors, const OperatorSpec& a) {
-    variable_list saved{any_requires_grad(tensors) ? v : at::Tensor()};
-    saved.insert(saved.end(), tensors.begin(), tensors.end());
-    ctx->save_for_backward(std::move(saved));
+  static at::Tensor forward(AutogradContext* ctx, const at::Tensor& v, const OperatorSpec& a) {
+    if (!a.tensors.empty()) ctx->save_for_backward(a.tensors);  // to notice where one is changed meanwhile
     ctx->saved_data["kind"] = a.kind;
     ctx->saved_data["shape"] = a.shape;
     ctx->saved_data["parameters"] = a.parameters;
     ctx->saved_data["transposed"] = a.transposed;
+    ctx->saved_data["has tensors"] = !a.tensors.empty();
     return apply_on_loops(*make_operator(a), v, /*transposed=*/false);
   }
 
   static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
-    const auto saved = ctx->get_saved_variables();
-    const auto tensors = at::TensorList(saved).slice(1);
-    variable_list all(tensors.size() + 2);
-    if (!grads[0].defined()) return all;
-    OperatorSpec a{ctx->saved_data["kind"].toStringRef(), ctx->saved_data["shape"].toIntVector(),
-                   ctx->saved_data["parameters"].toDoubleVector(), tensors.vec(),
-                   ctx->saved_data["transposed"].toBool()};
-    std::vector<int64_t> needed{0};
-    for (size_t i = 1; i <= tensors.size(); ++i) needed.push_back(ctx->needs_input_grad(i));
-    if (std::find(needed.begin(), needed.end(), 1) != needed.end()) {
-      const auto of_tensors = gradients_of_tensors(a, saved[0], grads[0], needed);
-      for (size_t i = 0; i < tensors.size(); ++i)
-        if (needed[i + 1]) all[i + 1] = of_tensors[i];
-    }
-    a.transposed = !a.transposed;
-    if (ctx->needs_input_grad(0)) all[0] = product(a, grads[0]);
-    return all;
-  }
-
- private:
-  /// ∂⟨ḡ, A v⟩/∂ each tensor; by what autograd records where it has to be differentiable.
-  static std::vector<at::Tensor> gradients_of_tensors(const OperatorSpec& a, const at::Tensor& v, const at::Tensor& bar,
-                                                      at::IntArrayRef needed) {
-    if (!at::GradMode::is_enabled()) return make_operator(a)->product_rule(bar, v);
-    const auto inputs = a.tensors;
-    return gradients_of({make_operator(a)->apply(v)}, {bar}, inputs, needed.slice(1), /*create_graph=*/true);
+    if (!grads[0].defined()) return {{}, {}};
+    const OperatorSpec transpose{ctx->saved_data["kind"].toStringRef(), ctx->saved_data["shape"].toIntVector(),
+                                 ctx->saved_data["parameters"].toDoubleVector(),
+                                 ctx->saved_data["has tensors"].toBool() ? ctx->get_saved_variables() : variable_list{},
+                                 !ctx->saved_data["transposed"].toBool()};
+    return {product(transpose, grads[0]), {}};
   }
 };
+
+bool is_constant(const OperatorSpec& a) {
+  const auto is_inference = [](const at::Tensor& t) { return t.is_inference(); };  // no node can save it
+  return !any_requires_grad(a.tensors) && !any_tangent(a.tensors) && !is_function(a) &&
+         std::none_of(a.tensors.begin(), a.tensors.end(), is_inference);
+}
 
 at::Tensor product(const OperatorSpec& a, const at::Tensor& v) {
   const auto made = make_operator(a);
@@ -78,14 +63,14 @@ at::Tensor product(const OperatorSpec& a, const at::Tensor& v) {
   if (!plain || !no_mode_is_on()) return made->apply(v);
   const bool recorded = at::GradMode::is_enabled() && (v.requires_grad() || any_requires_grad(a.tensors));
   if (!recorded) return apply_on_loops(*made, v, /*transposed=*/false);
-  return is_function(a) ? made->apply(v) : Product::apply(v, at::TensorList(a.tensors), a);
+  return is_constant(a) ? Product::apply(v, a) : made->apply(v);
 }
 
 at::Tensor apply(const at::Tensor& v, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
                  at::ArrayRef<double> parameters, bool transposed) {
   const auto a = spec(tensors, kind, shape, parameters, transposed);
   // A is linear. Torch's own forward mode takes hundreds of µs for each product with a tensor that has no tangent.
-  if (has_tangent(v) && !any_tangent(tensors) && !is_function(a)) {
+  if (has_tangent(v) && is_constant(a)) {
     const auto tangent = product(a, v._fw_grad(/*level=*/0));
     return at::_make_dual(product(a, v._fw_primal(/*level=*/0)), tangent, /*level=*/0);
   }

@@ -1,8 +1,8 @@
 #include "prdp/steppers/flow/rollout.h"
 
 #include "prdp/autograd/detach_failed.h"
+#include "prdp/autograd/for_each_cotangent.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/steppers/flow/cotangents.h"
 #include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/flow/step_node.h"
 #include "prdp/steppers/rollout_loops.h"
@@ -16,12 +16,7 @@ SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, con
                           FlowOutput output = FlowOutput::kNext) {
   const auto step = flow_step(equation, u, options);
   const auto out = output_of(step, output, equation.dt);
-  const auto on_failure = options.on_failure;
-  if (on_failure != OnFailure::kRaise && out.requires_grad())
-    out.register_hook([on_failure](const at::Tensor& cotangent) {
-      return usable_cotangent(cotangent, /*status=*/{}, /*has_pressure=*/true, on_failure).bar;
-    });
-  return {on_failure == OnFailure::kZeroGrad ? detach_failed(out, step.info.status) : out, step.info};
+  return {options.on_failure == OnFailure::kZeroGrad ? detach_failed(out, step.info.status) : out, step.info};
 }
 
 SolveResult one_step(const FlowEquation& equation, const at::Tensor& u, FlowOutput output,
@@ -63,7 +58,11 @@ SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tenso
     auto sizes = coefficients.sizes().vec();
     sizes[0] = u.size(0);
     coefficients = coefficients.expand(sizes);
-    coefficients.register_hook([](const at::Tensor& g) { return cleared(g, nonfinite(g).flatten(1).any(1)); });
+    coefficients.register_hook([](const at::Tensor& cotangents) {
+      return for_each_cotangent(cotangents, [](const at::Tensor& g) {
+        return std::vector<at::Tensor>{cleared(g, nonfinite(g).flatten(1).any(1))};
+      })[0];
+    });
   }
   found.u = at::cat({found.u.narrow(1, 0, d), make_operator(diffusion)->apply(p)}, 1);
   return found;
