@@ -8,7 +8,6 @@
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/operators/with_autograd.h"
 
 /// The operators as torch ops, made of plain tensor operations, so that autograd goes through them; without it, of the
 /// CPU loops.
