@@ -78,7 +78,8 @@ std::string Controller::about_metric() const {
       std::all_of(history.end() - kGrown, history.end(), [&](const Record& r) { return r.metric > bound; });
   if (!grows) return {};
   text << "the " << metric_name() << " grows: " << history.back().metric << " after " << least->metric
-       << " in interval " << least - history.begin() << "; lower the learning rate, solve further, or go back to the weights "
+       << " in interval " << least - history.begin()
+       << "; lower the learning rate, solve further, or go back to the weights "
           "of then";
   return text.str();
 }
