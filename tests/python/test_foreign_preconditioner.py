@@ -50,7 +50,7 @@ def test_without_a_transpose_it_is_refused_where_it_would_be_differentiated():
         prdp.linear_solve(A, b, solver, backward="unrolled")[0].sum().backward()
 
 
-def test_a_learned_one_is_said_to_be_a_constant():
+def test_a_learned_one_is_said_to_be_a_constant(always):
     weight = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
     learned = operators.Function(lambda r, w: r + w * r, tensors=weight, symmetric=True)
     b = random(2, N, seed=1).requires_grad_()

@@ -64,7 +64,7 @@ def test_in_float32_the_mean_is_to_be_taken_off_once_more():
     assert prdp.linear_solve(a, b - b.mean(), prdp.CG(500))[1].solved.all()
 
 
-def test_multigrid_alone_in_float32_is_not_sent_to_gmres():
+def test_multigrid_alone_in_float32_is_not_sent_to_gmres(always):
     torch.manual_seed(0)
     a, b = operators.Diffusion(torch.full((1, 341), 10.0), shift=0.1, boundary="flux"), torch.randn(1, 1, 341)
     with pytest.raises(torch.linalg.LinAlgError, match="take CG with multigrid, Direct or float64"):
