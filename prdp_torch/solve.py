@@ -40,8 +40,7 @@ class AdjointLog:
         self.number: int = self._kept.number
 
     def read(self) -> "SolveInfo | None":
-        entry = _C.read_adjoint_log(self.number)
-        return None if entry is None else SolveInfo(*entry)
+        return _as_info(_C.read_adjoint_log(self.number))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "AdjointLog":
         return AdjointLog()
@@ -68,8 +67,7 @@ class LogOfRollout(AdjointLog):
         return LogOfStep(self.log, step)
 
     def read(self) -> "SolveInfo | None":
-        entry = _C.join_adjoint_logs([self.of_step(step).number for step in range(self.steps)])
-        return None if entry is None else SolveInfo(*entry)
+        return _as_info(_C.join_adjoint_logs([self.of_step(step).number for step in range(self.steps)]))
 
 
 class AdjointLogs(list[AdjointLog]):
@@ -79,8 +77,11 @@ class AdjointLogs(list[AdjointLog]):
         super().__init__(AdjointLog() for _ in range(steps))
 
     def read(self) -> "SolveInfo | None":
-        entry = _C.join_adjoint_logs([log.number for log in self])
-        return None if entry is None else SolveInfo(*entry)
+        return _as_info(_C.join_adjoint_logs([log.number for log in self]))
+
+
+def _as_info(report: tuple[Any, ...] | None) -> "SolveInfo | None":
+    return None if report is None else SolveInfo(*report)
 
 
 class SolveInfo(NamedTuple):

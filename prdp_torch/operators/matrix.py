@@ -48,13 +48,11 @@ class Matrix(Operator):
 
     def apply(self, v: Tensor) -> Tensor:
         """Return A v, with gradients. v: (batch, n), or (n,)."""
-        _check.dense("Matrix.apply", "v", v)
-        return super().apply(v) if v.dim() > 1 else super().apply(v.unsqueeze(0)).squeeze(0)
+        return super().apply(v.unsqueeze(0)).squeeze(0) if _is_lone(v) else super().apply(v)
 
     def apply_transpose(self, v: Tensor) -> Tensor:
         """Return Aᵀ v, with gradients. v: (batch, n), or (n,)."""
-        _check.dense("Matrix.apply_transpose", "v", v)
-        return super().apply_transpose(v) if v.dim() > 1 else super().apply_transpose(v.unsqueeze(0)).squeeze(0)
+        return super().apply_transpose(v.unsqueeze(0)).squeeze(0) if _is_lone(v) else super().apply_transpose(v)
 
     def dense(self, dtype: torch.dtype = torch.float64) -> Tensor:
         """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples."""
@@ -121,6 +119,11 @@ class Matrix(Operator):
         return made
 
 
+def _is_lone(v: object) -> bool:
+    """Whether it is a vector without an axis for the batch; what it is at all, the product checks."""
+    return isinstance(v, Tensor) and v.dim() < 2
+
+
 def _has_sorted_columns(crow: Tensor, col: Tensor) -> bool:
     """Whether the columns of each row increase, (n + 1,) and (nnz,) or a batch of them."""
     n = crow.shape[-1] - 1
@@ -142,7 +145,8 @@ def _check_csr_gradient(matrix: Tensor, crow: Tensor, col: Tensor) -> None:
     if not matrix.requires_grad or not torch.is_grad_enabled() or torch.compiler.is_compiling():
         return
     # Of a CSR tensor that is a leaf, torch gets it right, and of what is computed from it.
-    if not _has_sorted_columns(crow, col) and torch_private.is_made_by(matrix, "SparseCompressedTensorBackward0"):
+    is_wrong = matrix.grad_fn is not None and not _has_sorted_columns(crow, col)
+    if is_wrong and torch_private.is_made_by(matrix, "SparseCompressedTensorBackward0"):
         raise ValueError(
             "linear_solve: torch gives the gradient of this sparse CSR tensor to the wrong values, as the columns of a "
             "row are not sorted, or repeat; take operators.Matrix.csr(crow, col, values, size), or sort them"

@@ -89,3 +89,12 @@ def test_many_cotangents_at_once():
     (found,) = torch.autograd.grad(pressure, nu, weights, is_grads_batched=True, retain_graph=True)
     each = [torch.autograd.grad(pressure, nu, w, retain_graph=True)[0] for w in weights]
     torch.testing.assert_close(found, torch.stack(each), rtol=1e-10, atol=0)
+
+
+@ways
+def test_nan_in_the_cotangent_of_a_pressure_raises(way):
+    with WAYS[way]():
+        u = noise(2, 2, *CASES["cavity"][0]).requires_grad_()
+        pressure = flow("cavity").step_and_pressure(u)[1]
+        with pytest.raises(torch.linalg.LinAlgError, match=r"sample 1 NONFINITE_INPUT at index \[2, 0, 0\]"):
+            pressure[1, 0, 0, 0].mul(torch.nan).backward()

@@ -33,6 +33,12 @@ std::vector<T> for_each_axis(const std::vector<T>& given, size_t axes, const cha
   return given.size() == axes ? given : std::vector<T>(axes, given.front());
 }
 
+/// Whether t is (batch or 1, *sample).
+bool is_batch_of(const at::Tensor& t, const std::vector<int64_t>& sample) {
+  return t.dim() == 1 + static_cast<int64_t>(sample.size()) &&
+         t.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(sample));
+}
+
 }  // namespace
 
 std::vector<double> DiffusionOperator::Box::packed() const {
@@ -110,10 +116,6 @@ void DiffusionOperator::check_shapes(const std::vector<at::Tensor>& tensors) con
   const auto &kappa = tensors[0], &shift = tensors[1];
   auto of_sample = shape_;
   if (per_axis_) of_sample.insert(of_sample.begin(), dim());
-  const auto is_batch_of = [](const at::Tensor& t, const std::vector<int64_t>& sample) {
-    return t.dim() == 1 + static_cast<int64_t>(sample.size()) &&
-           t.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(sample));
-  };
   TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && is_batch_of(kappa, of_sample),
                     "Diffusion: kappa must have shape (batch or 1, ", per_axis_ ? "axes, " : "", "*shape), got ",
                     kappa.sym_sizes());
@@ -131,11 +133,9 @@ void DiffusionOperator::take_robin(const std::vector<at::Tensor>& tensors, int64
   const auto& h = tensors[2 + robin_.size()];
   auto side = shape_;
   side.erase(side.begin() + axis);
-  const auto whole = c10::fromIntArrayRefSlow(side);
-  TORCH_CHECK_VALUE(h.dim() == 0 || (h.dim() == dim() && h.sym_sizes().slice(1) == c10::SymIntArrayRef(whole)),
-                    "Diffusion: h of the ", end == 0 ? "low" : "high", " side of axis ", axis,
-                    " must be a number or have shape (batch or 1, *side), where side is ", at::IntArrayRef(side),
-                    ", got ", h.sym_sizes());
+  TORCH_CHECK_VALUE(h.dim() == 0 || is_batch_of(h, side), "Diffusion: h of the ", end == 0 ? "low" : "high",
+                    " side of axis ", axis, " must be a number or have shape (batch or 1, *side), where side is ",
+                    at::IntArrayRef(side), ", got ", h.sym_sizes());
   const auto taken = in_dtype(h, kappa_.scalar_type());
   robin_.push_back(h.dim() == 0 ? taken : taken.unsqueeze(1 + axis).unsqueeze(1));
 }

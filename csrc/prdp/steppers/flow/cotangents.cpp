@@ -40,12 +40,11 @@ SolveInfo UsableCotangent::reported(SolveInfo info) const {
 UsableCotangent usable_cotangent(const at::Tensor& cotangent, const at::Tensor& status, bool has_pressure,
                                  OnFailure on_failure) {
   auto bar = status.defined() ? without_failed(cotangent, status, on_failure) : cotangent;
-  const bool solves_do = flow_kernels::can_run(bar) && !has_pressure;
-  if (solves_do || (!bar.is_cpu() && on_failure == OnFailure::kRaise)) return {bar};
+  if (flow_kernels::can_run(bar) && !has_pressure) return {bar};
   // One pass, which almost always ends it: a NaN or Inf is in the sum as well.
   if (bar.is_cpu() && std::isfinite(bar.detach().sum().item<double>())) return {bar};
   const auto refused = nonfinite(bar.detach()).flatten(1).any(1);
-  if (bar.is_cpu() && !flow_kernels::can_run(bar)) {
+  if (bar.is_cpu() || on_failure == OnFailure::kRaise || on_failure == OnFailure::kWarn) {  // the host may look
     if (!refused.any().item<bool>()) return {bar};
     report_nonfinite(bar.detach(), refused, on_failure);
   }

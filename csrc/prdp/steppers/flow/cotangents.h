@@ -13,8 +13,8 @@ struct UsableCotangent {
 };
 
 /// Leaves out the samples that failed, `status` (batch,) or undefined, where `on_failure` says so, and those whose
-/// cotangent is not finite. On the CPU the latter raise or warn as failed adjoint solves do. On a device, where a look
-/// would wait, the solves do; and kernels leave them out themselves, but for the cotangent of a pressure.
+/// cotangent is not finite. The latter raise or warn as failed adjoint solves do. Kernels and their solves do all of
+/// that themselves, but for the cotangent of a pressure.
 UsableCotangent usable_cotangent(const at::Tensor& cotangent, const at::Tensor& status, bool has_pressure,
                                  OnFailure on_failure);
 
