@@ -12,6 +12,16 @@ using Rows = std::vector<bool>;  // which samples
 inline bool any(const Rows& rows) { return std::find(rows.begin(), rows.end(), true) != rows.end(); }
 inline bool all(const Rows& rows) { return std::find(rows.begin(), rows.end(), false) == rows.end(); }
 
+/// The samples that are in both, and those of `rows` that are not in `others`.
+inline Rows both(Rows rows, const Rows& others) {
+  for (size_t i = 0; i < rows.size(); ++i) rows[i] = rows[i] && others[i];
+  return rows;
+}
+inline Rows except(Rows rows, const Rows& others) {
+  for (size_t i = 0; i < rows.size(); ++i) rows[i] = rows[i] && !others[i];
+  return rows;
+}
+
 /// t with zeros in all samples except these, even if they were not finite; differentiable.
 at::Tensor only(const at::Tensor& t, const Rows& rows);
 /// The samples without NaN and Inf.

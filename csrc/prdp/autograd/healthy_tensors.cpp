@@ -2,7 +2,7 @@
 
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/status.h"
+#include "prdp/solvers/solver.h"
 
 namespace prdp {
 
@@ -18,6 +18,14 @@ bool is_of_samples(const OperatorSpec& a, size_t k, int64_t batch) {
   const auto axes = batched_axes(a.kind, static_cast<int64_t>(a.shape.size()), a.tensors.size());
   return t.layout() == at::kStrided && t.dim() > 0 && t.size(0) == batch && (!axes || (*axes)[k] == t.dim());
 }
+
+namespace {
+/// Whether it is known which tensors the samples share. Of a Function, one whose first extent is that of the batch may
+/// be shared.
+bool knows_axes(const OperatorSpec& a) {
+  return batched_axes(a.kind, static_cast<int64_t>(a.shape.size()), a.tensors.size()).has_value();
+}
+}  // namespace
 
 Rows has_finite_tensors(const OperatorSpec& a, int64_t batch) {
   Rows rows(batch, true);
@@ -39,13 +47,25 @@ at::Tensor with_healthy_rows(const at::Tensor& t, const Rows& healthy) {
 
 OperatorSpec with_healthy_tensors(OperatorSpec a, const Rows& take_part) {
   const auto batch = static_cast<int64_t>(take_part.size());
-  if (all(take_part) || !any(take_part)) return a;
+  if (all(take_part)) return a;
   for (size_t k = 0; k < a.tensors.size(); ++k) {
     if (!is_of_samples(a, k, batch)) continue;
-    auto healthy = finite_rows(a.tensors[k].reshape({batch, -1}));
-    for (int64_t i = 0; i < batch; ++i) healthy[i] = healthy[i] || take_part[i];
+    auto healthy = take_part;
+    if (!knows_axes(a)) {  // it may be shared
+      const auto finite = finite_rows(a.tensors[k].reshape({batch, -1}));
+      for (int64_t i = 0; i < batch; ++i) healthy[i] = healthy[i] || finite[i];
+    }
     a.tensors[k] = with_healthy_rows(a.tensors[k], healthy);
   }
+  return a;
+}
+
+OperatorSpec with_ones_where_refused(OperatorSpec a, const at::Tensor& status) {
+  if (!knows_axes(a)) return a;
+  const auto refused = is_refused(status);
+  for (size_t k = 0; k < a.tensors.size(); ++k)
+    if (auto& t = a.tensors[k]; is_of_samples(a, k, status.size(0)))
+      t = t.masked_fill(per_sample(refused, t).to(t.device()), 1.0);
   return a;
 }
 

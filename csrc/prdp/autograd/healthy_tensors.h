@@ -18,8 +18,11 @@ Rows has_finite_tensors(const OperatorSpec& a, int64_t batch);
 /// t with the first of these rows in place of all others.
 at::Tensor with_healthy_rows(const at::Tensor& t, const Rows& healthy);
 
-/// A for the samples that take part: in each tensor that is not finite in another sample, that has the rows of one that
-/// does. A tensor that all samples share is finite where any takes part, and stays as it is.
+/// A in which the samples that take no part have the tensors of one that does; of a Function, where theirs are not
+/// finite. Tensors that all samples share stay.
 OperatorSpec with_healthy_tensors(OperatorSpec a, const Rows& take_part);
+
+/// A in which the refused samples have tensors of ones, where nobody may look which they are; a Function stays.
+OperatorSpec with_ones_where_refused(OperatorSpec a, const at::Tensor& status);
 
 }  // namespace prdp

@@ -10,7 +10,8 @@ at::Tensor reachable_part(const Operator& a, const at::Tensor& v) {
   const auto part = a.project(a.project(v));
   if (!a.needs_projection()) return part;
   const double rounding = 4.0 * epsilon_of(v);  // of every entry: all that is left of the cotangent of a sum, say
-  return cleared(part, (part.detach().abs() <= rounding * v.detach().abs()).flatten(1).all(1));
+  const auto size = v.detach().abs().flatten(1), left = part.detach().abs().flatten(1);
+  return cleared(part, (left <= rounding * size).all(1) & size.any(1));  // a zero keeps its derivative
 }
 
 namespace {

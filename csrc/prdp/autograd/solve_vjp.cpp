@@ -8,7 +8,9 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/finite_rows.h"
 #include "prdp/autograd/healthy_tensors.h"
+#include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/report_failures.h"
@@ -28,11 +30,7 @@ at::Tensor without_failed(const at::Tensor& derivative, const at::Tensor& status
     }
     if (!any) return derivative;
   }
-  // is_failure() and is_refused() of a tensor: keep them alike.
-  const auto lost = all_failures ? status.lt(static_cast<int64_t>(SolveStatus::kStagnated))
-                                 : status.eq(static_cast<int64_t>(SolveStatus::kZeroDiagonal))
-                                       .logical_or(status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)));
-  return cleared(derivative, lost);
+  return cleared(derivative, all_failures ? is_failure(status) : is_refused(status));
 }
 
 namespace {
@@ -53,10 +51,11 @@ at::Tensor may_overflow(const at::Tensor& lambda, const at::Tensor& u) {
          1e-3 * limits_of(lambda).largest / static_cast<double>(lambda.numel());
 }
 
-/// Takes the samples whose ḡ may overflow out of λ and marks them, without a look by the host.
-void leave_out_overflow_on_device(at::Tensor& lambda, const at::Tensor& u, at::Tensor& status) {
+/// Takes the samples whose ḡ may overflow out of λ and u and marks them, without a look by the host.
+void leave_out_overflow_on_device(at::Tensor& lambda, at::Tensor& u, at::Tensor& status) {
   const auto overflowing = may_overflow(lambda, u);
   lambda = cleared(lambda, overflowing);
+  u = cleared(u, overflowing);
   status = status.masked_fill(overflowing & (status >= static_cast<int64_t>(SolveStatus::kStagnated)),
                               static_cast<int64_t>(SolveStatus::kOverflow));
 }
@@ -78,12 +77,14 @@ void report_overflow(SolveInfo& info, const Rows& finite, const OperatorSpec& tr
 /// The products for the tensors of A where the host may look: it sums, looks, and sums again without the samples that
 /// overflowed, which lose b̄ as well and are reported.
 template <class Products>
-std::vector<at::Tensor> products_by_sample(SolveVjp& found, const at::Tensor& lambda, const at::Tensor& cotangent,
-                                           const OperatorSpec& a, const OperatorSpec& transpose, const SolveOptions& o,
+std::vector<at::Tensor> products_by_sample(SolveVjp& found, const at::Tensor& lambda, const at::Tensor& u,
+                                           const at::Tensor& cotangent, const OperatorSpec& a,
+                                           const OperatorSpec& transpose, const SolveOptions& o,
                                            const Products& products_of) {
   const auto healthy = make_operator(with_healthy_tensors(a, not_refused(found.info.status)));
   Rows finite(cotangent.size(0), true);
-  auto products = finite_sum(finite, [&](const Rows& some) { return products_of(*healthy, only(lambda, some)); });
+  auto products =
+      finite_sum(finite, [&](const Rows& some) { return products_of(*healthy, only(lambda, some), only(u, some)); });
   if (all(finite)) return products;
   if (auto& b_bar = found.gradients[0]; b_bar.defined()) b_bar = only(lambda, finite);
   report_overflow(found.info, finite, transpose, cotangent, o);
@@ -97,15 +98,18 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   auto transpose = a;
   transpose.transposed = !a.transposed;
   const auto o = options_of_adjoint(options);
-  auto [lambda, info] = adjoint_solve(transpose, cotangent, o, /*x0=*/{});
+  // The solve takes the part of a cotangent that Aᵀ reaches; after an adjoint solve, the part that A reaches is taken.
+  const bool is_second = a.transposed && is_singular(a);
+  const auto rhs = is_second ? reachable_part(*make_operator(transpose), cotangent) : cotangent;
+  auto [lambda, info] = adjoint_solve(transpose, rhs, o, /*x0=*/{});
   if (o.on_failure == OnFailure::kZeroGrad) lambda = without_failed(lambda, info.status, o.on_failure);
 
   SolveVjp found{std::vector<at::Tensor>(needed.size()), std::move(info)};
   if (needed[0]) found.gradients[0] = lambda;
   const bool needs_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
   if (!u.defined() || !needs_a) return found;
-  const auto products_of = [&](const Operator& op, const at::Tensor& of_lambda) {
-    auto products = op.product_rule(of_lambda, u);
+  const auto products_of = [&](const Operator& op, const at::Tensor& of_lambda, const at::Tensor& of_u) {
+    auto products = op.product_rule(of_lambda, of_u);
     for (size_t i = 0; i < products.size(); ++i)
       products[i] = needed[i + 1] && products[i].defined() ? products[i].neg() : at::Tensor();
     return products;
@@ -113,14 +117,17 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   std::vector<at::Tensor> products;
   // An overflow of ḡ must stay with its sample.
   if (!waits_for_report(o) && gpu::may_run_kernel(cotangent, o.solver) && !in_torch_func()) {
-    leave_out_overflow_on_device(lambda, u, found.info.status);
+    auto kept_u = u;
+    leave_out_overflow_on_device(lambda, kept_u, found.info.status);
     if (needed[0]) found.gradients[0] = lambda;
     if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
-    products = products_of(*make_operator(a), lambda);
+    products = products_of(*make_operator(a), lambda, kept_u);
   } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
-    products = products_of(*make_operator(a), lambda);
+    const bool may_be_refused = o.on_failure != OnFailure::kRaise;
+    const auto healthy = may_be_refused ? with_ones_where_refused(a, found.info.status) : a;
+    products = products_of(*make_operator(healthy), lambda, u);
   } else {
-    products = products_by_sample(found, lambda, cotangent, a, transpose, o, products_of);
+    products = products_by_sample(found, lambda, u, cotangent, a, transpose, o, products_of);
   }
   std::copy(products.begin(), products.end(), found.gradients.begin() + 1);
   return found;

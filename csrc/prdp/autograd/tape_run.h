@@ -55,7 +55,7 @@ class TapeRun {
   /// The cotangent of the last iterate is in x_bar, memory of the tape.
   TapeRun(Tape<T>& tape, Space& space, TapeBack<T>& back, Method method, KeptStates<T>& kept, T* x_bar, Stop stop)
       : tape_(tape), space_(space), back_(back), method_(std::move(method)), kept_(kept), stop_(stop) {
-    each([&](auto& part, size_t i) {
+    for_each_part([&](auto& part, size_t i) {
       const bool is_x = static_cast<void*>(&part) == &method_.x;
       bars_[i] = {is_x ? x_bar : tape_.new_memory(), is_x, T(0)};
     });
@@ -64,10 +64,10 @@ class TapeRun {
   void start() {
     space_.record(true);
     method_.start();
-    each([&](auto& part, size_t i) { remember(part, begin_, i); });
+    for_each_part([&](auto& part, size_t i) { remember(part, begin_, i); });
     tape_.keep();
     space_.record(false);
-    each([&](auto& part, size_t) { make_constant(part); });
+    for_each_part([&](auto& part, size_t) { make_constant(part); });
     done_ = 0;
   }
   void step() {
@@ -76,16 +76,16 @@ class TapeRun {
   }
   void save(int64_t slot) {
     int64_t v = 0, n = 0;
-    each([&](auto& part, size_t) {
+    for_each_part([&](auto& part, size_t) {
       if constexpr (is_number<decltype(part)>) kept_.number(slot, n++) = part.value;
-      else if (reads(part)) std::copy_n(space_.value(part), tape_.length(), kept_.vector(slot, v++));
+      else if (is_read(part)) std::copy_n(space_.value(part), tape_.length(), kept_.vector(slot, v++));
     });
   }
   void load(int64_t slot, int64_t k) {
     int64_t v = 0, n = 0;
-    each([&](auto& part, size_t) {
+    for_each_part([&](auto& part, size_t) {
       if constexpr (is_number<decltype(part)>) space_.set(part, kept_.number(slot, n++));
-      else space_.set(part, reads(part) ? kept_.vector(slot, v++) : nullptr);
+      else space_.set(part, is_read(part) ? kept_.vector(slot, v++) : nullptr);
     });
     method_.resume(k);
     done_ = k;
@@ -94,33 +94,13 @@ class TapeRun {
   void step_back(int64_t, int64_t k) {
     tape_.release();
     space_.record(true);
-    // What the state at hand was made of: by the start, or as new inputs of this iteration alone.
-    Parts before = begin_;
-    if (k > 0) {
-      each([&](auto& part, size_t i) {
-        if constexpr (is_number<decltype(part)>) space_.set(part, part.value);
-        remember(part, before, i);
-      });
-    } else {
-      each([&](auto& part, size_t i) { recall(part, before, i); });
-    }
+    const Parts before = inputs_of(k);
     method_.resume(k);
     iterate_once();
-    // The cotangents of the state after it, and then back to those of the state before it.
-    each([&](auto& part, size_t i) {
-      if constexpr (!is_number<decltype(part)>) {
-        if (bars_[i].holds) tape_.give_bar(part.version, bars_[i].vector);
-      } else if (part.node >= 0) {
-        tape_.numbers[part.node].bar += bars_[i].number;
-      }
-    });
+    seed_cotangents();
     back_.take_back(tape_.kept_ops(), tape_.kept_numbers());
     space_.record(false);
-    if (k == 0) return;
-    each([&](auto& part, size_t i) {
-      if constexpr (is_number<decltype(part)>) bars_[i].number = tape_.numbers[before.numbers[i].node].bar;
-      else bars_[i].holds = tape_.take_bar(before.vectors[i].version, bars_[i].vector);
-    });
+    if (k > 0) collect_cotangents(before);
   }
   /// The cotangent of b.
   T* finish() {
@@ -142,23 +122,53 @@ class TapeRun {
     std::array<Vector, kVectors + kNumbers> vectors;
     std::array<Number, kVectors + kNumbers> numbers;
   };
-  /// Notes a part of a state; takes it back from there; and makes it a constant.
+  /// Notes part i of a state.
   static void remember(const Vector& part, Parts& parts, size_t i) { parts.vectors[i] = part; }
   static void remember(const Number& part, Parts& parts, size_t i) { parts.numbers[i] = part; }
+  /// Makes it what was noted.
   static void recall(Vector& part, const Parts& parts, size_t i) { part.version = parts.vectors[i].version; }
   static void recall(Number& part, const Parts& parts, size_t i) { part = parts.numbers[i]; }
+  /// Cuts it off from the numbers that it was made of.
   static void make_constant(Vector&) {}
   static void make_constant(Number& part) { part = part.value; }
 
-  bool reads(const Vector& part) const { return &part != &method_.x || carries_x_ || stop_.rtol > 0.0; }
+  /// Whether an iteration reads this part of the state before it.
+  bool is_read(const Vector& part) const { return &part != &method_.x || carries_x_ || stop_.rtol > 0.0; }
   /// Of x and what the method carries, each once.
   template <class Body>
-  void each(const Body& body) {
+  void for_each_part(const Body& body) {
     size_t i = 0;
     auto carried = method_.iteration_state();
     carries_x_ = std::apply([&](auto&... part) { return ((static_cast<void*>(&part) == &method_.x) || ...); }, carried);
     if (!carries_x_) body(method_.x, i++);
     std::apply([&](auto&... part) { (body(part, i++), ...); }, carried);
+  }
+  /// What the state at hand is made of: by the start, or as new inputs of iteration k alone.
+  Parts inputs_of(int64_t k) {
+    Parts parts = begin_;
+    for_each_part([&](auto& part, size_t i) {
+      if (k == 0) return recall(part, parts, i);
+      if constexpr (is_number<decltype(part)>) space_.set(part, part.value);
+      remember(part, parts, i);
+    });
+    return parts;
+  }
+  /// Hands the cotangents of the state after an iteration to the tape.
+  void seed_cotangents() {
+    for_each_part([&](auto& part, size_t i) {
+      if constexpr (!is_number<decltype(part)>) {
+        if (bars_[i].holds) tape_.give_bar(part.version, bars_[i].vector);
+      } else if (part.node >= 0) {
+        tape_.numbers[part.node].bar += bars_[i].number;
+      }
+    });
+  }
+  /// Takes those of the state before it from there.
+  void collect_cotangents(const Parts& before) {
+    for_each_part([&](auto& part, size_t i) {
+      if constexpr (is_number<decltype(part)>) bars_[i].number = tape_.numbers[before.numbers[i].node].bar;
+      else bars_[i].holds = tape_.take_bar(before.vectors[i].version, bars_[i].vector);
+    });
   }
   void iterate_once() {
     detail::repeat_iteration(method_, stop_.rtol, done_, [&] {

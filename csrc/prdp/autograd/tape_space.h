@@ -237,7 +237,9 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     std::copy(found.begin(), found.end(), y);
   }
   bool surely_all(const Scalar& a) const { return values_.surely_all(a.value); }
+  bool all_ended(const Scalar& ended) const { return values_.all_ended(ended.value); }
   Scalar constant(const Scalar& a) const { return a.value; }
+  Scalar enough2() const { return values_.enough2(); }
   int derivatives() const { return recording_ ? 1 : 0; }
   bool started() const { return values_.started(); }
 

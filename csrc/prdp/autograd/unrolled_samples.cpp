@@ -46,6 +46,7 @@ class SampleVjps {
     retry_implicitly();
     if (zero_grad_) leave_out_failed_adjoints();
     fill_missing();
+    finish_outcomes();
     return {std::move(found_.gradients), report()};
   }
 
@@ -54,6 +55,7 @@ class SampleVjps {
     std::vector<at::Tensor> gradients;  // summed over samples; leave_out_failed_adjoints() takes some out, here alone
     std::vector<SampleOutcome> outcomes;  // of each sample
     Rows finite;  // the samples whose gradient is
+    std::vector<std::vector<at::Tensor>> of_samples;  // as UnrolledVjp has them
   };
 
   const at::Tensor& cotangent_;
@@ -73,7 +75,7 @@ class SampleVjps {
   const Rows has_finite_inverse_ = finite_inverses();
   const bool needs_gradient_of_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
   const bool may_mislead_ = may_mislead(options_.solver);
-  const std::vector<int64_t> wanted_ = wanted();  // needed_, and b̄ where retry_implicitly() looks at it
+  const std::vector<int64_t> needed_with_b_bar_ = needed_with_b_bar();  // which retry_implicitly() looks at
   const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
   const double judged_rtol_ =
       options_.adjoint_rtol.value_or(options_.solver.rtol);  // by which adjoint solves are judged
@@ -81,7 +83,6 @@ class SampleVjps {
   const Rows has_finite_cotangent_ = finite_rows(cotangent_);  // the others are refused
   const at::Tensor finite_cotangent_ = only(cotangent_, has_finite_cotangent_);
   Differentiated found_{};
-  std::vector<std::vector<at::Tensor>> of_samples_{};  // as UnrolledVjp has them
   at::Tensor u_{};
 
   Rows finite_inverses() const {
@@ -94,10 +95,15 @@ class SampleVjps {
     if (zero_grad_ && is_failure(status(i))) return false;
     return status(i) != SolveStatus::kOverflow && (has_finite_inverse_[i] || !is_failure(status(i)));
   }
-  std::vector<int64_t> wanted() const {
+  std::vector<int64_t> needed_with_b_bar() const {
     auto all = needed_.vec();
     if (needs_gradient_of_a_ && may_mislead_) all[0] = 1;
     return all;
+  }
+  Rows samples_with(Derivative derivative) const {
+    Rows rows(batch_);
+    for (int64_t i = 0; i < batch_; ++i) rows[i] = derivatives_[i] == derivative;
+    return rows;
   }
   SolveStatus status(int64_t i) const { return static_cast<SolveStatus>(statuses_[i]); }
 
@@ -110,22 +116,23 @@ class SampleVjps {
                                                        : Derivative::kOfIterations);
   }
 
-  /// Sums the gradients of these samples, without those that are not finite. finite_sum() may ask for fewer samples in
-  /// between, and last for those that stay, so that the outcomes end as theirs.
+  /// Sums the gradients of these samples, without those that are not finite. finite_sum() looks for them among fewer
+  /// and fewer samples; its last call is for those that stay, and what that leaves in `found` is theirs.
   Differentiated differentiate(Rows rows) {
-    std::vector<SampleOutcome> outcomes(batch_);
-    auto gradients = finite_sum(rows, [&](const Rows& some) {
+    Differentiated found;
+    found.outcomes.resize(batch_);
+    found.gradients = finite_sum(rows, [&](const Rows& some) {
       auto [sum, applications, of_samples] = vjp_of_iterations(some);
-      of_samples_ = std::move(of_samples);
+      found.of_samples = std::move(of_samples);
       const auto products = to_host<int64_t>(applications, batch_);
       for (int64_t i = 0; i < batch_; ++i)
-        outcomes[i] = {status(i), counts_[i], products[i], std::numeric_limits<double>::quiet_NaN()};
-      auto solved = some;
-      for (int64_t i = 0; i < batch_; ++i) solved[i] = some[i] && derivatives_[i] == Derivative::kOfSolution;
-      if (any(solved)) add_adjoint_solves(solved, sum, outcomes);
+        found.outcomes[i] = {status(i), counts_[i], products[i], std::numeric_limits<double>::quiet_NaN()};
+      const auto solved = both(some, samples_with(Derivative::kOfSolution));
+      if (any(solved)) add_adjoint_solves(solved, sum, found.outcomes);
       return sum;
     });
-    return {std::move(gradients), std::move(outcomes), std::move(rows)};
+    found.finite = std::move(rows);
+    return found;
   }
 
   UnrolledVjp vjp_of_iterations(const Rows& rows) const {
@@ -135,7 +142,7 @@ class SampleVjps {
       runs[i] = rows[i] && derivatives_[i] == Derivative::kOfIterations && counts_[i] > 0;
       if (runs[i]) caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
     }
-    if (!any(runs)) return {std::vector<at::Tensor>(wanted_.size()), at::zeros({batch_}, at::kLong)};
+    if (!any(runs)) return {std::vector<at::Tensor>(needed_.size()), at::zeros({batch_}, at::kLong)};
     UnrolledSolve solve{spec_, solved_.x0, options_.solver, caps.to(solved_.iterations.device()),
                         options_.checkpoint_every};
     auto b = solved_.b;
@@ -146,7 +153,7 @@ class SampleVjps {
       solve.x0 = with_healthy_rows(solved_.x0, runs);
       b = with_healthy_rows(b, runs);
     }
-    return of_iterations_(only(finite_cotangent_, rows), b, solve, wanted_);
+    return of_iterations_(only(finite_cotangent_, rows), b, solve, needed_with_b_bar_);
   }
 
   /// Adds the gradients of these samples to `sum`, and notes what came of their adjoint solves.
@@ -157,7 +164,7 @@ class SampleVjps {
     adjoint.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
     adjoint.adjoint_rtol = std::min(judged_rtol_, kRoundings / 2 * epsilon_of(solved_.b));
     const auto u = needs_gradient_of_a_ ? solution() : at::Tensor();
-    const auto found = implicit_vjp(only(finite_cotangent_, rows), u, spec_, adjoint, wanted_, any_solve_);
+    const auto found = implicit_vjp(only(finite_cotangent_, rows), u, spec_, adjoint, needed_with_b_bar_, any_solve_);
     for (size_t i = 0; i < sum.size(); ++i) add_to(sum[i], found.gradients[i]);
     const auto iterations = to_host<int64_t>(found.info.iterations, batch_);
     const auto residual = to_host<double>(found.info.residual, batch_);
@@ -175,13 +182,11 @@ class SampleVjps {
   /// The implicit gradient takes the place of those that mislead (misleading_derivatives.h).
   void retry_implicitly() {
     if (!may_mislead_ || !found_.gradients[0].defined()) return;
-    auto rows = solved_samples(solved_);
-    for (int64_t i = 0; i < batch_; ++i)
-      rows[i] = rows[i] && derivatives_[i] == Derivative::kOfIterations && found_.finite[i];
+    auto rows = both(both(solved_samples(solved_), samples_with(Derivative::kOfIterations)), found_.finite);
     if (!any(rows)) return;
     const auto allowed = allowed_disagreement(solved_, options_.solver);
     auto misleading = misleading_b_bar(*a_, finite_cotangent_, found_.gradients[0], rows, allowed);
-    for (int64_t i = 0; i < batch_; ++i) rows[i] = rows[i] && !misleading[i];
+    rows = except(rows, misleading);
     if (needs_gradient_of_a_ && any(rows)) {
       const auto more = can_be_alone() ? misleading_alone(rows, allowed) : misleading_together(rows, allowed);
       for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || more[i];
@@ -194,7 +199,7 @@ class SampleVjps {
 
   /// Whether samples share a tensor of A, so that its gradient is a sum over them, of which their shares are known.
   bool can_be_alone() const {
-    if (batch_ == 1 || of_samples_.empty()) return false;
+    if (batch_ == 1 || found_.of_samples.empty()) return false;
     for (size_t k = 0; k < spec_.tensors.size(); ++k)
       if (needed_[k + 1] && !is_of_samples(spec_, k, batch_)) return true;
     return false;
@@ -204,14 +209,15 @@ class SampleVjps {
     Rows misleading(batch_);
     for (int64_t i = 0; i < batch_; ++i) {
       if (!rows[i]) continue;
-      const auto one = [&](const at::Tensor& t) { return t.defined() ? t.narrow(0, i, 1) : t; };
-      auto a = spec_;
-      for (size_t k = 0; k < a.tensors.size(); ++k)
-        if (is_of_samples(spec_, k, batch_)) a.tensors[k] = one(a.tensors[k]);
-      auto found = of_samples_[i];
-      found.insert(found.begin(), one(found_.gradients[0]));
-      misleading[i] =
-          found[0].defined() && misleading_a_bar(a, found, one(solution()).detach(), needed_, {true}, {allowed[i]})[0];
+      const auto of_sample = [&](const at::Tensor& t) { return t.defined() ? t.narrow(0, i, 1) : t; };
+      auto a_of_sample = spec_;
+      for (size_t k = 0; k < spec_.tensors.size(); ++k)
+        if (is_of_samples(spec_, k, batch_)) a_of_sample.tensors[k] = of_sample(spec_.tensors[k]);
+      auto gradients = found_.of_samples[i];
+      gradients.insert(gradients.begin(), of_sample(found_.gradients[0]));
+      gradients.resize(needed_.size());  // a sample may have added nothing
+      misleading[i] = gradients[0].defined() && misleading_a_bar(a_of_sample, gradients, of_sample(solution()).detach(),
+                                                                 needed_, {true}, {allowed[i]})[0];
     }
     return misleading;
   }
@@ -229,8 +235,9 @@ class SampleVjps {
   }
 
   void leave_out_failed_adjoints() {
-    auto good = found_.finite;
-    for (int64_t i = 0; i < batch_; ++i) good[i] = found_.finite[i] && !adjoint_failed(i);
+    Rows failed(batch_);
+    for (int64_t i = 0; i < batch_; ++i) failed[i] = adjoint_failed(i);
+    const auto good = except(found_.finite, failed);
     if (good != found_.finite) found_.gradients = differentiate(good).gradients;  // the failed stay in the report
   }
   bool adjoint_failed(int64_t i) const {
@@ -245,11 +252,14 @@ class SampleVjps {
         gradients[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
   }
 
-  SolveInfo report() {
+  /// Tells the samples without a finite gradient.
+  void finish_outcomes() {
     for (int64_t i = 0; i < batch_; ++i)
       if (!found_.finite[i])
         found_.outcomes[i] = zero_instead(derivatives_[i] == Derivative::kRefused ? SolveStatus::kNonfiniteInput
                                                                                   : SolveStatus::kOverflow);
+  }
+  SolveInfo report() {
     auto failures = found_.outcomes;  // the forward solve has reported its own
     for (int64_t i = 0; i < batch_; ++i)
       if (found_.finite[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;

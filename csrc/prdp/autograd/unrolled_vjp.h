@@ -8,19 +8,15 @@
 namespace prdp {
 
 /// The product of the cotangent of u with the derivative of the map (b, tensors of A) → u that a solve ran. It is the
-/// torch op prdp::unrolled_vjp, which runs the iterations again. There are these kinds of samples:
-///   its cotangent or its gradient is not finite     fails with NONFINITE_INPUT or OVERFLOW
-///   solved to rounding                              gets the implicit derivative, because its last iterations, or
-///                                                   those that it no longer needed, say nothing about that of u
-///   solved by a method that is no polynomial in A, but b̄ or Ā is too far from the implicit one
-///                                                   the same: b excites few eigenvectors, and the derivative of the
-///                                                   iterations is one in those directions alone, or rounding; or
-///                                                   a recurrence came near a breakdown
-///   failed, with on_failure="zero_grad"             get none
-///   all others                                      get the derivative of exactly their iterations
-/// The report of a sample with the implicit derivative is that of its adjoint solve. For the last kind it has the
+/// torch op prdp::unrolled_vjp, which runs the iterations again. What a sample gets:
+///   its cotangent or its gradient is not finite   zeros; it fails with NONFINITE_INPUT or OVERFLOW
+///   it is solved to rounding                      the implicit derivative, as its last iterations are rounding
+///   its b̄ or Ā is far from the implicit one       the implicit derivative (misleading_derivatives.h says what is far)
+///   it overflowed, or failed with NaN in M⁻¹ or   none
+///   with on_failure="zero_grad"
+///   else                                          the derivative of exactly its iterations
+/// The report of a sample with the implicit derivative is that of its adjoint solve. Of the last kind it has the
 /// iterations and the status of the forward solve, and NaN as residual, because no system is solved.
-/// What is too far, misleading_derivatives.h says.
 SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
                       const SolveOptions& options, at::IntArrayRef needed);
 
@@ -43,8 +39,8 @@ struct UnrolledSolve {
 };
 
 /// The gradients of b and of each tensor, undefined where `needed` (b first) is 0 or there is no derivative; and the
-/// number of products with A and Aᵀ for each sample. Where the way there has them, also what each sample adds to the
-/// gradient of each tensor of A; empty for samples that did not run.
+/// number of products with A and Aᵀ for each sample. From tape_vjp() also what each sample adds to the gradient of each
+/// tensor of A, empty for samples that added nothing; but not where the method divides by the diagonal.
 struct UnrolledVjp {
   std::vector<at::Tensor> gradients;
   at::Tensor operator_applications;

@@ -31,7 +31,7 @@ inline bool is_singular(const OperatorSpec& a) { return is_singular(a.kind); }
 /// Of a tensor that is (batch, channel, *shape), (batch, *shape), or (batch, *side) with a side of that shape.
 inline constexpr int64_t kLikeState = -1, kLikeField = -2, kLikeSide = -3;
 
-/// The numbers of axes of an operator's `tensors` tensors where they have one for the batch, on a grid of `axes`.
+/// For each of an operator's `tensors` tensors, how many axes it has if the batch is one of them; `axes`: of the grid.
 std::optional<std::vector<int64_t>> batched_axes(const std::string& kind, int64_t axes, size_t tensors);
 
 /// The row of a table. Raises ValueError for a kind that has none.

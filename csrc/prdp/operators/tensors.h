@@ -50,7 +50,9 @@ inline at::Tensor sample_norms(const at::Tensor& v) {
 }
 
 /// max |v| of each sample, (batch,) in float64.
-inline at::Tensor sample_maxima(const at::Tensor& v) { return v.abs().flatten(1).amax(1).to(at::kDouble); }
+inline at::Tensor sample_maxima(const at::Tensor& v) {
+  return at::linalg_vector_norm(v.flatten(1), INFINITY, at::IntArrayRef{1}, /*keepdim=*/false, at::kDouble);
+}
 
 /// The powers of two that bring these magnitudes to the order of one.
 inline at::Tensor power_of_two_scale(const at::Tensor& magnitude) {

@@ -168,6 +168,15 @@ Backward backward_from_name(std::string_view name);
 OnFailure on_failure_from_name(std::string_view name);
 Start start_from_name(std::string_view name);
 
+/// The same of a tensor of statuses.
+inline at::Tensor is_failure(const at::Tensor& status) {
+  return status.lt(static_cast<int64_t>(SolveStatus::kStagnated));
+}
+inline at::Tensor is_refused(const at::Tensor& status) {
+  return status.eq(static_cast<int64_t>(SolveStatus::kZeroDiagonal))
+      .logical_or(status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)));
+}
+
 /// The report of a solve: tensors of shape (batch,), with one value per sample.
 struct SolveInfo {
   at::Tensor iterations;             // iterations that produced the returned u
