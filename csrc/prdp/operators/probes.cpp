@@ -25,7 +25,12 @@ at::Tensor in_each_channel(const at::Tensor& vector, const at::Tensor& like) {
 
 at::Tensor estimated_norm(const Operator& a, const at::Tensor& like) {
   const at::NoGradGuard no_grad;
-  const auto norm_of = [](const at::Tensor& v) { return v.flatten(1).norm(2, 1); };
+  const auto norm_of = [](const at::Tensor& v) {  // whose squares may leave the range of the dtype
+    const auto magnitude = v.abs().flatten(1).amax(1);
+    const auto usable = magnitude.gt(0).logical_and(magnitude.isfinite());
+    const auto scale = power_of_two_scale(at::where(usable, magnitude, at::ones_like(magnitude)));
+    return (v * per_sample(scale, v)).flatten(1).norm(2, 1) / scale;
+  };
   constexpr int products = 4;
   auto v = unstructured_like(like);
   v = v / per_sample(norm_of(v), v);

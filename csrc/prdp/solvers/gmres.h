@@ -51,7 +51,7 @@ class GmresMethod {
     space_.fill_zero(x);
     space_.copy(space_.b(), r_);
     residual2_ = space_.b2();
-    one_ = problem_.start(residual2_);
+    one_ = problem_.start(residual2_, space_.enough2());
     ready_ = true;
     confirmed_ = !space_.started();
   }
@@ -90,6 +90,7 @@ class GmresMethod {
   auto iteration_state() { return std::tie(x, problem_.scale()); }
   void resume(int64_t done) {
     if (done == 0) return start();
+    problem_.leave_first();
     residual2_ = space_.b2() / 0;  // no cycle before to take back
     ready_ = false;
   }
@@ -107,7 +108,7 @@ class GmresMethod {
       space_.apply(space_.is_preconditioned() ? z_ : u_[j], u_[j + 1]);
       if (space_.derivatives() > 0) products_[j] = u_[j + 1];
       problem_.add_column(j, orthogonalise(j));
-      if (space_.surely_all(problem_.ended(j))) return j + 1;
+      if (space_.all_ended(problem_.ended(j))) return j + 1;
     }
     return m_;
   }

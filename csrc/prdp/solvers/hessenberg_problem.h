@@ -26,15 +26,20 @@ class HessenbergProblem {
         rhs_(numbers.template array<Scalar>(m)),
         damped_(numbers.template array<Scalar>(m)) {}
 
-  /// Before the first cycle, where ‖r‖² is given; returns 1.
-  Scalar start(const Scalar& residual2) {
+  /// Before the first cycle, where ‖r‖² is given; returns 1. The first cycle ends once its least residual² is below
+  /// `enough2`. Later ones are whole, as their estimates may be rounding.
+  Scalar start(const Scalar& residual2, const Scalar& enough2) {
     exhausted_ = numbers_.is_zero(residual2);
     scale_ = residual2 * 0;
-    return numbers_.is_zero(scale_);
+    enough2_ = enough2;
+    return is_first_ = numbers_.is_zero(scale_);
   }
+  void leave_first() { is_first_ = is_first_ * 0; }
   /// Begins a cycle with v₀ = r/‖r‖.
   void begin(const Scalar& length) {
     columns_[0].g = length;
+    enough2_ = enough2_ * is_first_;
+    leave_first();
     solved2_ = length * length * kSolved2;
     columns_[0].inverse_length = numbers_.inverse(length, length);
     exhausted_ = numbers_.is_zero(length);
@@ -45,11 +50,13 @@ class HessenbergProblem {
   PRDP_NOINLINE void add_column(int64_t j, const Scalar& length) {
     scale_ = numbers_.larger(scale_, length);
     // At sixteen units the space counts as exhausted, and goes on; at one, it ends.
-    exhausted_ = exhausted_ + vanishes(h(j + 1, j), scale_);
+    exhausted_ = exhausted_ + vanishes(h(j + 1, j), scale_) * numbers_.is_not_zero(columns_[j].inverse_length);
     h(j + 1, j) = h(j + 1, j) * is_above(h(j + 1, j), scale_ * kOneUnit);
     const Scalar next = h(j + 1, j);
     rotate(j);
-    columns_[j + 1].inverse_length = numbers_.inverse(next, rounding(columns_[j + 1].g));
+    const Scalar g = columns_[j + 1].g;  // ±the least residual so far
+    const Scalar is_enough = numbers_.is_larger(enough2_, g * g);
+    columns_[j + 1].inverse_length = numbers_.inverse(next, rounding(g)) * numbers_.is_zero(is_enough);
   }
   /// Where y takes a step so long that its rounding exceeds ‖r‖ = size, A is singular to the dtype, and y is damped.
   PRDP_NOINLINE void minimise(int64_t columns, const Scalar& size, const Scalar& one) {
@@ -76,7 +83,7 @@ class HessenbergProblem {
   }
 
   Scalar& y(int64_t j) { return columns_[j].y; }
-  /// 1 over the length of what v_j was before it was scaled; 0 where that was rounding.
+  /// 1 over the length of what v_j was before it was scaled; 0 where that was rounding, or the cycle has ended.
   const Scalar& inverse_length(int64_t j) const { return columns_[j].inverse_length; }
   /// Not zero where the Krylov space could hardly be extended: it holds all that A reaches, but for rounding.
   const Scalar& exhausted() const { return exhausted_; }
@@ -148,6 +155,7 @@ class HessenbergProblem {
   ArrayOf<Numbers, Scalar> rhs_, damped_;  // of damp()
   Scalar exhausted_{}, scale_{};
   Scalar solved2_{};  // ‖r‖² of a cycle that solves
+  Scalar enough2_{}, is_first_{};
 };
 
 }  // namespace prdp

@@ -79,6 +79,7 @@ class SampleNumbers {
   Scalar is_zero(Scalar value) const { return value == 0; }
   Scalar is_not_zero(Scalar value) const { return value != 0; }
   bool surely_all(Scalar value) const { return value != 0; }
+  bool all_ended(Scalar ended) const { return ended != 0; }
 
   // ---- what iterate.h asks for
   static std::array<double, 1> values_of(Scalar value) { return {static_cast<double>(value)}; }

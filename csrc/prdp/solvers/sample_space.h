@@ -217,6 +217,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     std::vector<T> work(numbers_of_solve_damped(n));
     solve_damped(r, g, n, std::numeric_limits<T>::epsilon() * scale, y, work.data());
   }
+  Scalar enough2() const { return static_cast<T>(state_->enough2); }
   using SampleNumbers<T>::restore;
   void restore(Scalar where, const T* from, Vector to) {
     if (where != 0) copy(from, to);

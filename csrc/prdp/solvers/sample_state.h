@@ -27,7 +27,8 @@ enum class Returned {
 struct SampleState {
   int64_t cap = 0;         // iterations allowed
   double b2 = 0.0;         // ‖b‖²
-  bool active = true;      // still iterating; a frozen sample's u no longer changes
+  double enough2 = 0.0;  // a residual² at which a cycle need not go on: a tenth of rtol ‖b‖, to be safe from rounding
+  bool active = true;  // still iterating; a frozen sample's u no longer changes
   bool candidate = false;  // its residual has just come below rtol, to be confirmed
   bool concluded = false;  // residual2 is the true one of the last iterate, and conclude() leaves the sample alone
   SolveStatus status = SolveStatus::kMaxIter;
@@ -37,7 +38,7 @@ struct SampleState {
   int64_t looked_at = 0;  // iterations when the residual was last looked at
   double checked2 = 0.0;  // the residual then
   int64_t next_look = 0;  // iterations when it is to be looked at next
-  int64_t best = 0;       // iterations after which the residual was smallest
+  int64_t best = 0;  // iterations after which the residual was smallest
   double best2 = std::numeric_limits<double>::infinity();
   int64_t cycles_without_progress = 0;  // for methods whose residual never grows
   double last_progress2 = std::numeric_limits<double>::infinity();  // the residual that last fell
@@ -47,6 +48,10 @@ struct SampleState {
   double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
   Returned returned = Returned::kLast;
 
+  void set_b2(double norm2, double rtol) {
+    b2 = norm2;
+    enough2 = 0.01 * rtol * rtol * norm2;
+  }
   void note(double fresh2) {
     residual2 = fresh2;
     if (!(fresh2 < best2)) return;

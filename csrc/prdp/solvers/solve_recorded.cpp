@@ -14,13 +14,13 @@ namespace prdp {
 namespace {
 
 /// b - A start, differentiable in b and the tensors of A; the start is a constant.
-at::Tensor rest_of(const Operator& a, const at::Tensor& b, const at::Tensor& start) {
+at::Tensor residual_of_start(const Operator& a, const at::Tensor& b, const at::Tensor& start) {
   return start.defined() ? b - a.project(a.apply(start)) : b;
 }
 
 /// One more iteration of the samples whose cap is beyond the `done` that they have taken.
 template <class M>
-void iterate_again(TensorSpace& space, M& method, std::vector<SampleState>& states, double rtol, int64_t done) {
+void iterate_once_more(TensorSpace& space, M& method, std::vector<SampleState>& states, double rtol, int64_t done) {
   const auto wanted = [&](const SampleState& s) { return done < s.cap; };
   space.freeze_unless(states, wanted);
   detail::repeat_iteration(method, rtol, done, [&] {
@@ -64,15 +64,15 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   const auto b2 = space.values_of(space.b2());
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = host_caps[i];
-    states[i].b2 = b2[i];
+    states[i].set_b2(b2[i], solver.rtol);
   }
   if (takes_start(solver.method, x0)) {
     const auto start = make_start(a, whole.detach(), x0).x;
-    space.start_from(start, rest_of(a, whole, start));
+    space.start_from(start, residual_of_start(a, whole, start));
   }
   const auto u = with_method(solver.method, solver.restart, space, [&](auto m) {
     m.start();
-    for (int64_t done = 0; done < most; ++done) iterate_again(space, m, states, solver.rtol, done);
+    for (int64_t done = 0; done < most; ++done) iterate_once_more(space, m, states, solver.rtol, done);
     return a.project_solution(space.solution(m.x)) / scale;
   });
   std::vector<int64_t> applications;
@@ -104,7 +104,7 @@ StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rh
   TensorSpace space(system, rhs, states, /*recording=*/true);
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = caps_[i];
-    states[i].b2 = b2_[i];
+    states[i].set_b2(b2_[i], solver_.rtol);
   }
   State after;
   with_method(solver_.method, solver_.restart, space, [&](auto method) {
@@ -115,7 +115,7 @@ StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rh
       std::apply([&](auto&... part) { ((part = before[next++]), ...); }, state);
       method.resume(done);
     }
-    iterate_again(space, method, states, solver_.rtol, done);
+    iterate_once_more(space, method, states, solver_.rtol, done);
     std::apply([&](const auto&... part) { (after.push_back(part), ...); }, state);
     return 0;
   });

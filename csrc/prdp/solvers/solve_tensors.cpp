@@ -19,7 +19,7 @@ namespace prdp {
 namespace {
 
 /// The states before the first iteration: those of samples that are settled are not active. One copy.
-void fill_states(std::vector<SampleState>& states, const PreparedBatch& batch, const at::Tensor& b2) {
+void fill_states(std::vector<SampleState>& states, const PreparedBatch& batch, const at::Tensor& b2, double rtol) {
   const auto& applied = batch.start.applied;
   const auto number = [&](const at::Tensor& t) { return t.flatten().to(b2.scalar_type()); };
   const auto host = at::stack({number(batch.status), number(b2),
@@ -30,7 +30,7 @@ void fill_states(std::vector<SampleState>& states, const PreparedBatch& batch, c
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     s.status = static_cast<SolveStatus>(static_cast<int64_t>(status[i]));
-    s.b2 = norm2[i];
+    s.set_b2(norm2[i], rtol);
     s.rounding2 = rounding[i] * rounding[i];
     s.active = s.status == SolveStatus::kMaxIter;
     s.concluded = !s.active;
@@ -85,7 +85,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, batch.rhs, states);
-  fill_states(states, batch, space.b2());  // before start_from(), after which b2() is that of the start's residual
+  // Before start_from(), after which b2() is that of the start's residual.
+  fill_states(states, batch, space.b2(), solver.rtol);
   if (batch.start.x.defined()) space.start_from(batch.start.x, batch.start.r);
 
   const auto run = [&](auto method) {

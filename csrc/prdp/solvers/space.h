@@ -169,8 +169,13 @@ concept KrylovSpace =
       s.damp(R, g, n, scale, keep, h);
       /// Whether a differs from zero in every sample; a space that would have to look closely may say no.
       { s.surely_all(a) } -> std::same_as<bool>;
+      /// Whether the cycle of every sample has `ended`, is not zero; a space that would have to look closely may say
+      /// no. Where it has, no products are counted up to residual().
+      { s.all_ended(a) } -> std::same_as<bool>;
       /// a itself; its derivative is that of a constant.
       { s.constant(a) } -> std::same_as<typename S::Scalar>;
+      /// A squared residual at which a cycle need not go on (SampleState::enough2).
+      { s.enough2() } -> std::same_as<typename S::Scalar>;
       /// How often the operations are recorded to be differentiated.
       { s.derivatives() } -> std::same_as<int>;
       /// Whether the samples have a start.

@@ -48,6 +48,7 @@ void TensorGmres::start() {
   residual2_ = space_.b2();
   exhausted_ = space_.is_zero(residual2_);
   scale_.assign(space_.b().size(0), 0.0);
+  is_first_ = true;
   ready_ = true;
   confirmed_ = !space_.started();
 }
@@ -124,6 +125,7 @@ at::Tensor TensorGmres::minimise() {
     const double* h = host.const_data_ptr<double>() + sample * (size + 1);
     const double length = std::sqrt(h[size]);
     HessenbergProblem problem(numbers, m_);
+    problem.start(h[size], is_first_ ? space_.enough2_of(sample) : 0.0);
     problem.scale() = scale_[sample];
     problem.begin(length);
     int64_t columns = 0;
@@ -142,6 +144,7 @@ at::Tensor TensorGmres::minimise() {
     scale_[sample] = problem.scale();
     exhausted.mutable_data_ptr<double>()[sample] = problem.exhausted();
   }
+  is_first_ = false;
   exhausted_ = exhausted;
   return y.to(h_.options());
 }

@@ -41,6 +41,7 @@ class TensorGmres {
   at::Tensor r_, kept_x_, kept_r_, residual2_, exhausted_;
   at::Tensor v_, h_;           // (m, batch, unknowns) and (batch, m + 1, m), anew for each cycle
   std::vector<double> scale_;  // of each sample, the largest ‖A v‖ so far: what is rounding beside it is zero
+  bool is_first_ = true;       // the next cycle
   bool ready_ = false;         // r_ and residual2_ belong to x
   bool confirmed_ = true;      // and were computed from it: those of a start were not
 };

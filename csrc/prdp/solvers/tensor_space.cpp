@@ -66,7 +66,7 @@ TensorSpace::Scalar TensorSpace::update_iterate_and_residual(const Scalar& alpha
 
 TensorSpace::Vector TensorSpace::product(const Vector& v) {
   interruption::Watch::local().look();
-  for (size_t i = 0; i < states_.size(); ++i) states_[i].applications += active_.empty() || active_[i];
+  for (size_t i = 0; i < states_.size(); ++i) states_[i].applications += is_active(i) && (ended_.empty() || !ended_[i]);
   return laid_out(system_.a.apply(in_loops_ ? v.detach() : v));  // a handle of its own, which a product may keep
 }
 
@@ -92,6 +92,7 @@ std::array<TensorSpace::Scalar, 2> TensorSpace::apply_along(const Vector& v, con
 }
 
 TensorSpace::Scalar TensorSpace::residual(const Vector& x, Vector& r) {
+  ended_.clear();
   const auto ax = product(solution(x));
   r = keep_frozen(system_.a.project((started() ? given_b_ : b_) - ax), r);
   return dot(r, r);
@@ -162,7 +163,8 @@ TensorSpace::Scalar TensorSpace::skeel_estimate2(const Vector& x) const {
   for (int64_t p = 0; p < kSignPatterns; ++p) add_to(scale2, system_.a.apply(u * signs_like(u, 0, p)).square());
   const auto scale = (scale2 / static_cast<double>(kSignPatterns)).sqrt();
   for (int64_t p = 0; p < kSignPatterns; ++p) {
-    const auto moved = laid_out(system_.a.solve_directly(scale * signs_like(u, n, p), /*transposed=*/false));
+    const auto moved =
+        in_units_of_x(laid_out(system_.a.solve_directly(scale * signs_like(u, n, p), /*transposed=*/false)));
     const auto square = dot(moved, moved);
     largest = largest.defined() ? at::maximum(largest, square) : square;  // NaN stays
   }
@@ -174,6 +176,24 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   const auto finite = per_sample(solution.isfinite().flatten(1).all(1), solution);
   note_broken(finite.logical_not());
   d = laid_out(at::where(finite, solution, at::zeros_like(solution)));
+}
+
+bool TensorSpace::all_ended(const Scalar& ended) {
+  if (!ended.is_cpu()) return false;  // other devices would have to be waited for; the basis goes on with zeros
+  const auto rows = values_of(ended);
+  ended_.resize(rows.size());
+  bool all = true;
+  for (size_t i = 0; i < rows.size(); ++i) {
+    ended_[i] = rows[i] != 0.0;
+    all = all && (ended_[i] || !is_active(i));
+  }
+  return all;
+}
+
+at::Tensor TensorSpace::enough2() const {
+  std::vector<double> squares;
+  for (const auto& s : states_) squares.push_back(s.enough2);
+  return at::tensor(squares, at::kDouble).to(b2_).view_as(b2_);
 }
 
 std::vector<double> TensorSpace::values_of(const Scalar& value) const {
@@ -194,6 +214,9 @@ const std::vector<double>& TensorSpace::operator_norm() {
   norms_ = to_host<double>(system_.a.norm(), batch);
   const bool known = std::any_of(norms_.begin(), norms_.end(), [](double norm) { return norm > 0.0; });
   if (!known) norms_ = to_host<double>(estimated_norm(system_.a, b_), batch);
+  if (!system_.scale_of_a.defined()) return norms_;
+  const auto scales = to_host<double>(system_.scale_of_a, batch);
+  for (int64_t i = 0; i < batch; ++i) norms_[i] *= scales[i];
   return norms_;
 }
 

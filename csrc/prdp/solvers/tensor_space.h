@@ -136,8 +136,11 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Scalar inverse(const Scalar& a, const Scalar& scale) const;
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   void damp(const Scalar* R, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep, Scalar* h) const;
-  bool surely_all(const Scalar&) const { return false; }  // the basis goes on with zeros
+  bool surely_all(const Scalar&) const { return false; }
+  bool all_ended(const Scalar& ended);
   Scalar constant(const Scalar& a) const { return a.detach(); }
+  Scalar enough2() const;
+  double enough2_of(int64_t sample) const { return states_[sample].enough2; }
   int derivatives() const { return recording_ ? 2 : 0; }
   bool started() const { return start_.defined(); }
 
@@ -155,8 +158,10 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   std::vector<bool> definite_factors(const Vector&) const { return surely_definite(); }
   /// u = start + scale_of_a x: the solution for the A that is not scaled.
   Vector solution(const Vector& x) const;
+  Vector in_units_of_x(const Vector& u) const { return system_.scale_of_a.defined() ? u / system_.scale_of_a : u; }
+  /// Scaled as A is, so that no square of a small u underflows.
   Scalar solution2(const Vector& x) const {
-    const auto u = solution(x);
+    const auto u = in_units_of_x(solution(x));
     return dot(u, u);
   }
   Scalar componentwise_scale2(const Vector& x, int64_t attempt) const;
@@ -184,6 +189,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   void note_broken(const at::Tensor& rows);
 
   // ---- products with A
+  bool is_active(size_t sample) const { return active_.empty() || active_[sample]; }
   /// A v, not scaled, and counted.
   Vector product(const Vector& v);
   /// The same; from then on, the scale of A is known.
@@ -212,6 +218,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   at::Tensor start_, given_b_;  // undefined: from zero
   States& states_;
   std::vector<bool> active_;
+  std::vector<bool> ended_;  // whose cycle is over; empty: of none
   at::Tensor active_mask_;  // undefined: every sample is active
   at::Tensor broken_;       // undefined: no breakdown so far
   double negligible_;

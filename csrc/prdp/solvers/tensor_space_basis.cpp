@@ -36,8 +36,8 @@ TensorSpace::Scalar TensorSpace::inverse(const Scalar& a, const Scalar& scale) c
 
 void TensorSpace::damp(const Scalar* R, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
                        Scalar* h) const {
-  // argmin ‖[R; ε s I] h - [g; 0]‖ by QR. Samples to keep get R = 0 and the identity below it, so that the stacked
-  // matrix has full rank.
+  // argmin ‖[R; ε s I] h - [g; 0]‖ by QR. Samples to keep get R = 0 and the identity below it, and so do those whose
+  // s is zero, as nothing was left to do: the stacked matrix has full rank.
   const auto wanted = keep.detach().eq(0);
   if (!wanted.any().item<bool>()) return;
   const at::NoTF32Guard full_precision;
@@ -48,7 +48,8 @@ void TensorSpace::damp(const Scalar* R, const Scalar* g, int64_t n, const Scalar
   const auto safe = [&](const Scalar& s) { return at::where(number(wanted), number(s), at::zeros({}, s.options())); };
   for (int64_t j = 0; j < n; ++j) {
     for (int64_t i = 0; i <= j; ++i) stacked.select(1, i).select(1, j).copy_(safe(R[hessenberg_column(j) + i]));
-    stacked.select(1, n + j).select(1, j).copy_(at::where(number(wanted), limits_of(b_).epsilon * number(scale), 1.0));
+    const auto is_damped = number(wanted).logical_and(number(scale).gt(0));
+    stacked.select(1, n + j).select(1, j).copy_(at::where(is_damped, limits_of(b_).epsilon * number(scale), 1.0));
     rhs.select(1, j).select(1, 0).copy_(safe(g[j]));
   }
   const auto [q, upper] = at::linalg_qr(stacked);

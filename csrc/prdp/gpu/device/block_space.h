@@ -92,6 +92,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     if (started_) add(start(), x);
   }
   bool started() const { return started_; }
+  Scalar enough2() const { return static_cast<T>(state_->enough2); }
 
   // ---- what space.h asks for
   Vector b() { return own(Vectors::kB); }
