@@ -197,3 +197,16 @@ def test_direct_steps_of_a_flow_at_their_rounding_are_solved():
     assert flow.info.solved.all()
     exact = flow.double().rollout(torch.zeros(1, 2, 32, 32, dtype=F64), 40)
     assert (states - exact).norm() <= 1e-6 * exact.norm()
+
+
+@pytest.mark.parametrize("max_iter", [1000, 10_000])
+def test_sweeps_that_stall_a_little_above_rtol_end_there(max_iter):
+    """Rounding holds Jacobi at a residual of 1.2e-5 on this Burgers operator; float64 goes on."""
+    n = 200
+    x = torch.arange(1, n + 1) / (n + 1) * 2 * torch.pi
+    u = ((x.sin() + 0.5 * (2 * x).sin()) / 1.3).expand(3, 1, n)
+    step = prdp.Burgers((n,), nu=1e-3, dt=50 / (n + 1), solver=prdp.Jacobi(max_iter))
+    step(u)
+    assert step.info.solved.all() and (step.info.iterations < 600).all() and (step.info.residual < 2e-5).all()
+    step(u.double())
+    assert (step.info.status == 1).all() and (step.info.residual <= 1e-5).all()

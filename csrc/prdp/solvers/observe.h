@@ -7,13 +7,6 @@
 /// How the loop around the methods (iterate.h) looks at residuals, and stops the samples that are done.
 namespace prdp::detail {
 
-/// Sweeps or cycles without progress for so long may be at their rounding, which takes a closer look.
-template <class Method>
-bool is_idle(const SampleState& s) {
-  constexpr int64_t patience = kContracts<Method> ? 2 : 128;
-  return (kTakesStrides<Method> || kContracts<Method>) && s.active && s.iterations - s.best > patience;
-}
-
 /// Of each sample, whether the space of a method of least residuals is exhausted; nothing for other methods.
 template <class Space, class Method>
 auto exhausted_of(Space& space, const Method& method) {
@@ -58,8 +51,9 @@ template <class Space, class Method>
 void stop_stalled(Space& space, const Method& method, typename Space::States& states, double rtol) {
   // Sweeps and cycles go on at their rounding for ever, and never claim what is below it.
   if constexpr (kTakesStrides<Method> || kContracts<Method>) {
-    stop_at_rounding_floor(space, method, states, rtol,
-                           [rtol](const SampleState& s) { return rtol > 0.0 && !s.candidate && is_idle<Method>(s); });
+    stop_at_rounding_floor(space, method, states, rtol, [rtol](const SampleState& s) {
+      return rtol > 0.0 && s.active && !s.candidate && is_idle<Method>(s);
+    });
   }
   if constexpr (kMayExhaust<Method>)
     stop_at_rounding_floor(space, method, states, rtol, [](const SampleState& s) {

@@ -18,19 +18,26 @@ auto rounding_floors(Space& space, const Method& method) {
   return floors;
 }
 
-/// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor; 32 for direct methods
-/// where rtol lies below that, as their sums are long; 100 where a space is exhausted.
+/// Sweeps or cycles without progress for so long may be at their rounding, which takes a closer look.
+template <class Method>
+bool is_idle(const SampleState& s) {
+  constexpr int64_t patience = kContracts<Method> ? 2 : 128;
+  return (kTakesStrides<Method> || kContracts<Method>) && s.iterations - s.best > patience;
+}
+
+/// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor, or nothing is gained
+/// any more; 32 for direct methods where rtol lies below that, as their sums are long; 100 where a space is exhausted.
 template <class Method>
 double slack_of_floor(const SampleState& s, double rtol, double floor) {
   if (s.status == SolveStatus::kBreakdown) return 100.0;
   const double target = rtol * std::sqrt(s.b2);
   if (kIsExact<Method>) return target <= 32.0 * floor ? 32.0 : 1.0;
-  return target <= floor ? 8.0 : 1.0;
+  return target <= floor || is_idle<Method>(s) ? 8.0 : 1.0;
 }
 
-/// Per sample: its floor, if it is `doubtful` and its residual is at most slack_of_floor() floors; else 0. Never a
-/// suspect: a residual above ‖b‖/10, as u is garbage then, or a floor above ‖b‖/4; in float64 above 1e-5 ‖b‖, which a u
-/// has that grew along a null vector that nobody named.
+/// The floor of each `doubtful` sample whose residual is at most slack_of_floor() floors; 0 for the others. Never of a
+/// residual above ‖b‖/10, as u is garbage then, nor a floor above ‖b‖/4; in float64 none above 1e-5 ‖b‖, which a u has
+/// that grew along a null vector that nobody named.
 template <class Space, class Method, class Predicate>
 auto floors_of_suspects(Space& space, const Method& method, const typename Space::States& states, double rtol,
                         const Predicate& doubtful) {
@@ -40,8 +47,8 @@ auto floors_of_suspects(Space& space, const Method& method, const typename Space
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
     const double floor = all_floors[i], b = std::sqrt(s.b2), residual = std::sqrt(s.residual2);
-    const bool says_something = floor <= largest_floor * b && residual <= 0.1 * b;
-    if (doubtful(s) && says_something && residual <= slack_of_floor<Method>(s, rtol, floor) * floor) floors[i] = floor;
+    const bool is_plausible = floor <= largest_floor * b && residual <= 0.1 * b;
+    if (doubtful(s) && is_plausible && residual <= slack_of_floor<Method>(s, rtol, floor) * floor) floors[i] = floor;
   }
   return floors;
 }
@@ -50,30 +57,31 @@ auto floors_of_suspects(Space& space, const Method& method, const typename Space
 inline constexpr double kRoundingsOfProduct = 64.0, kFewRoundings = 4.0;
 inline constexpr int64_t kManyEstimates = 8;  // at most kSignPatterns
 
-/// Whether a suspect's residual is rounding, by the p-th estimate of ε ‖|A| |u|‖. The first allows slack and many
-/// roundings. The others allow no slack and few roundings, as one sample then has several chances to pass.
+/// Whether a suspect's residual is rounding, by this attempt at an estimate of ε ‖|A| |u|‖. The first allows slack and
+/// many roundings. The others allow no slack and few roundings, as one sample then has several chances to pass.
 template <class Method>
-bool residual_is_rounding(const SampleState& s, double rtol, double floor, double rounding, int64_t p) {
+bool residual_is_rounding(const SampleState& s, double rtol, double floor, double rounding, int64_t attempt) {
   const double residual = std::sqrt(s.residual2);
-  if (p == 0) return residual <= slack_of_floor<Method>(s, rtol, floor) * (kRoundingsOfProduct * rounding);
+  if (attempt == 0) return residual <= slack_of_floor<Method>(s, rtol, floor) * (kRoundingsOfProduct * rounding);
   return residual <= floor && residual <= kFewRoundings * rounding;
 }
 
-/// Stops the `doubtful` samples whose residual is rounding: near the floor ε ‖A‖ ‖u‖, as above, and of the order of
-/// ε ‖|A| |u|‖, what a product rounds, as the floor overstates that where columns of A differ in size. An estimate from
-/// below stands for it, and misses the strongest coupling of two unknowns every second time: more `estimates` find it.
+/// Stops the `doubtful` samples whose residual is rounding: a few floors ε ‖A‖ ‖u‖ at most, and of the order of
+/// ε ‖|A| |u|‖, what a product rounds. The floor alone overstates that where columns of A differ in size. ‖|A| |u|‖ is
+/// estimated from below with random signs. One estimate in two misses the strongest coupling of two unknowns, so that
+/// there may be several `estimates`.
 template <class Space, class Method, class Predicate>
 PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
                                           double rtol, const Predicate& doubtful, int64_t estimates = 1) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
   auto suspected = floors_of_suspects(space, method, states, rtol, doubtful);  // 0: not suspected
-  for (int64_t p = 0; p < estimates; ++p) {
+  for (int64_t attempt = 0; attempt < estimates; ++attempt) {
     if (std::none_of(suspected.begin(), suspected.end(), [](double floor) { return floor > 0.0; })) return;
-    const auto componentwise_scale2 = space.values_of(space.componentwise_scale2(method.x, p));
+    const auto componentwise_scale2 = space.values_of(space.componentwise_scale2(method.x, attempt));
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
       const double floor = suspected[i], rounding = space.epsilon() * std::sqrt(componentwise_scale2[i]);
-      if (!(floor > 0.0) || !residual_is_rounding<Method>(s, rtol, floor, rounding, p)) continue;
+      if (!(floor > 0.0) || !residual_is_rounding<Method>(s, rtol, floor, rounding, attempt)) continue;
       s.stop(SolveStatus::kStagnated);
       s.floor2 = floor * floor;
       suspected[i] = 0.0;
