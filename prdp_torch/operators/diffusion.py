@@ -147,7 +147,7 @@ class Diffusion(Operator):
                 if side == "robin":  # in series with that of the side
                     h = width * full_precision(next(robin))
                     _check_of_side("h", h, conductance)
-                    conductance = conductance * h / (conductance + h)
+                    conductance = _in_series(conductance, h)
                 name, given = ("fluxes", fluxes) if side == "flux" else ("values", values)
                 _check_of_side(name, given[axis][end], conductance)
                 added = conductance * given[axis][end] / (width if side == "flux" else width**2)
@@ -186,6 +186,12 @@ class Diffusion(Operator):
                 f"{self.boundary}, in pairs (low, high), and {name} are {given!r:.80}"
             )
         return pairs
+
+
+def _in_series(a: Tensor, b: Tensor) -> Tensor:
+    """a b/(a + b) for a > 0 and b >= 0, of which autograd makes derivatives without a difference."""
+    flows = b > 0
+    return torch.where(flows, 1 / (1 / a + 1 / torch.where(flows, b, 1.0)), b)
 
 
 def _kind(side: Any) -> Any:

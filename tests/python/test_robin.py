@@ -190,3 +190,30 @@ def test_h_of_another_batch_is_named():
     a = Diffusion(torch.ones(1, 4), boundary=[(("robin", hole), "zero")])
     _, info = prdp.linear_solve(a, torch.ones(3, 1, 4), prdp.CG(9), on_failure="return")
     assert info.failed.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("u_ext", [0.0, 2.0, 20.0, 300.0])
+@pytest.mark.parametrize("h", [1e-3, 1.0, 1e3, 1e5, 1e8])
+def test_a_gradient_for_h_keeps_its_digits_in_float32(h, u_ext):
+    """u(0) = u_ext + 1/h + 1/2, so h² du(0)/dh = -1. The shares of A and of the sides cancel but for that."""
+    h = torch.tensor(h, requires_grad=True)
+    a = Diffusion(torch.ones(1, 32), boundary=[("flux", ("robin", h))])
+    u, _ = prdp.linear_solve(a, 1 + a.boundary_rhs(values=[(None, u_ext)]), prdp.Direct())
+    (gradient,) = torch.autograd.grad(u[0, 0, 0], h)
+    assert float(gradient * h.detach() ** 2) == pytest.approx(-1.0, abs=1e-4 + 3e-5 * u_ext)
+
+
+@pytest.mark.parametrize("h", [0.0, 1e-30, 0.7, 1e20])
+def test_what_autograd_records_of_a_robin_side_is_its_product_rule(h):
+    kappa, h = rand(2, 5).requires_grad_(), torch.tensor(h, dtype=F64, requires_grad=True)
+    v, w = rand(2, 1, 5, seed=1), rand(2, 1, 5, seed=2)
+    a = Diffusion(kappa, 0.3, boundary=[("flux", ("robin", h))])
+    rule = torch.autograd.grad((a.apply(v) * w).sum(), (kappa, h))
+    recorded = torch.autograd.grad((a.apply(v) * w).sum(), (kappa, h), create_graph=True)
+    tangents = [
+        torch.func.jvp(lambda k, h: (Diffusion(k, 0.3, boundary=[("flux", ("robin", h))]).apply(v) * w).sum(), *pair)[1]
+        for pair in [((kappa.detach(), h.detach()), (torch.zeros(2, 5, dtype=F64), torch.ones((), dtype=F64)))]
+    ]
+    for mine, other in zip(rule, recorded, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-12, atol=1e-30)
+    torch.testing.assert_close(tangents[0], rule[1], rtol=1e-12, atol=1e-30)

@@ -36,6 +36,14 @@ at::Tensor or_nan(const at::Tensor& t, const at::Tensor& allowed) {
   return t.masked_fill(allowed.logical_not(), std::numeric_limits<double>::quiet_NaN());
 }
 
+/// Of two conductances a > 0 and b >= 0 in series, a b/(a + b). Of the reciprocals autograd makes a²/(a + b)² and
+/// b²/(a + b)²; of the quotient it would make differences, of which float32 leaves nothing where b is large.
+at::Tensor in_series(const at::Tensor& a, const at::Tensor& b) {
+  const auto flows = b.gt(0);
+  const auto sum = (a.reciprocal() + at::where(flows, b, 1.0).reciprocal()).reciprocal();
+  return at::where(flows, sum, b);
+}
+
 /// Summed over the samples where these share one.
 at::Tensor like(const at::Tensor& tensor, const at::Tensor& sum) {
   if (tensor.dim() == 0) return total(sum);
@@ -74,7 +82,7 @@ std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) 
     const auto& h = robin(axis, end);
     const auto within = 2.0 * inverse_width2(axis) * cells,
                beyond = inverse_width(axis) * (h.dim() == 0 ? h : or_nan(h, h.ge(0)));
-    return factor * (within * (beyond / (within + beyond)));  // in series
+    return factor * in_series(within, beyond);
   };
   const auto around = wraps_around(axis) ? mean(first(averaged, d), last(averaged, d)) : at::Tensor();
   const auto low = around.defined() ? around : outer(0);
