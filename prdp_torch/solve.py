@@ -126,7 +126,7 @@ class SolveInfo(NamedTuple):
     @property
     def failed(self) -> Tensor:
         """Which samples failed (bool): their status is below STAGNATED."""
-        return self.status < SolveStatus.STAGNATED
+        return self.status < _STATUSES["STAGNATED"]
 
     @property
     def solved(self) -> Tensor:

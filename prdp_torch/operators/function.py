@@ -6,7 +6,7 @@ import inspect
 import types
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -78,6 +78,17 @@ class Function(Operator):
         null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
         given = {f"tensors_{i}": t for i, t in enumerate(tensors)}
         super().__init__([self._products.number], [], given, null_spaces)
+
+    if not TYPE_CHECKING:
+
+        @property
+        def shape(self) -> list[int]:
+            """The number of its products, kept as text: torch.compile would take one that changes for a size."""
+            return [int(self._number)]
+
+        @shape.setter
+        def shape(self, shape: list[int]) -> None:
+            self._number = str(shape[0])
 
     def __repr__(self) -> str:
         name = getattr(self._made_of[0], "__name__", type(self._made_of[0]).__name__)

@@ -1,6 +1,8 @@
 """`torch.compile` as users call it, without fullgraph: one graph, no warning, whatever K and the tolerances become."""
 
 import logging
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -146,3 +148,34 @@ def test_torch_export_records_a_step_and_torch_jit_trace_says_that_it_cannot():
     flow = prdp.Flow((8, 8), 0.01, 0.01)
     with torch.no_grad(), pytest.raises(TypeError, match="trace cannot record it"):
         torch.jit.trace(flow, torch.zeros(1, 2, 8, 8, dtype=torch.float64))
+
+
+def test_a_graph_takes_another_preconditioner_of_ones_own():
+    a, b = operators.Heat((6,), 0.1, 1.0), field((6,), batch=2)
+    compiled = torch.compile(
+        lambda b, m: prdp.linear_solve(a, b, prdp.CG(50, preconditioner=m))[0], backend="eager", fullgraph=True
+    )
+    expected = prdp.linear_solve(a, b, prdp.Direct())[0]
+    for scale in (1.0, 2.0, 3.0):
+        m = operators.Function(lambda r, scale=scale: scale * r, symmetric=True)
+        torch.testing.assert_close(compiled(b, m), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_graph_reads_which_samples_failed():
+    step = prdp.Heat((8,), 0.3, 0.1, prdp.CG(20), on_failure="zero_grad")
+    u = field((8,), batch=2)
+    u[1] = float("nan")
+
+    @torch.compile(fullgraph=True, backend="eager")
+    def run(u):
+        return step(u), step.info.failed, step.info.solved
+
+    _, failed, solved = run(u)
+    assert failed.tolist() == [False, True] and solved.tolist() == [True, False]
+
+
+def test_no_process_has_the_number_of_another_ones_function():
+    """Graphs that torch keeps on disk name a product by its number, and have the product of then in them."""
+    program = "from prdp_torch import operators; print(operators.Function(lambda v: v).shape[0])"
+    numbers = {subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout for _ in "ab"}
+    assert len(numbers) == 2

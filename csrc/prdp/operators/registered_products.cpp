@@ -1,6 +1,7 @@
 #include "prdp/operators/registered_products.h"
 
 #include <mutex>
+#include <random>
 #include <typeindex>
 #include <unordered_map>
 
@@ -13,7 +14,8 @@ namespace {
 struct Registry {
   std::mutex mutex;
   std::unordered_map<int64_t, std::weak_ptr<const RegisteredProducts>> entries;
-  int64_t last = 0;
+  /// No process has the numbers of another: torch keeps compiled graphs on disk, with the product of a number in them.
+  int64_t last = static_cast<int64_t>(std::random_device()()) << 24;
 };
 
 Registry& registry() {
@@ -53,7 +55,8 @@ std::shared_ptr<const RegisteredProducts> RegisteredProducts::find(int64_t numbe
     if (entry != registry().entries.end()) found = entry->second.lock();
   }
   TORCH_CHECK_VALUE(found, "Function: the operator no longer exists; keep ",
-                    in_language("it, and make it outside of what torch.func.linearize or torch.compile runs",
+                    in_language("it, and make it outside of what torch.func.linearize or torch.compile runs; "
+                                "torch.export does not save it",
                                 "its RegisteredProducts"));
   return found;
 }
