@@ -4,11 +4,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, Unpack
 
-from torch import Tensor
-
 from prdp_torch import _C, _check, data_parallel
 from prdp_torch.calls import between_graphs
-from prdp_torch.controller_interval import Ended, Interval, all_converged
+from prdp_torch.controller_interval import Ended, Interval, all_converged, take_over
 from prdp_torch.controller_records import PRDPSettings, Record, ToleranceRecord, ToleranceSettings
 from prdp_torch.types import Number, Refinable, Steppers
 
@@ -47,7 +45,7 @@ class _Attached(_Compiled):
         if process_group is not None and data_parallel.rank(who, process_group) < 0:
             raise ValueError(f"{who}: this process does not belong to process_group")
         self.process_group = process_group
-        self._warned_for, self._warned_unrefined_for, self._has_spoken = 0, 0, False
+        self._warned_for, self._warned_unrefined_for, self._has_spoken, self._has_said_who = 0, 0, False, False
         self._records: list[Any] = []  # what `history` has returned
         if not isinstance(steppers, Iterable):
             raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
@@ -56,6 +54,7 @@ class _Attached(_Compiled):
             for name, value in self._budget.items():
                 if value is not None and not hasattr(stepper, name):
                     raise TypeError(f"{who}: a stepper must have {name}, got {stepper!r}")
+        take_over(self.steppers, self)
         self._push()
 
     if not TYPE_CHECKING:
@@ -73,6 +72,9 @@ class _Attached(_Compiled):
 
     def _decide(self, metric: float, converged: bool | None, error: float | None) -> bool:
         """One step of the compiled controller, and what follows from it for the steppers."""
+        if (said := take_over(self.steppers, self)) and not self._has_said_who:
+            self._has_said_who = True
+            _C.warn(f"{type(self).__name__}: {said}")
         if converged is None:
             converged = all_converged(self.steppers)
         ended = Ended.of(self.steppers)
@@ -92,8 +94,7 @@ class _Attached(_Compiled):
             _C.warn(f"{warning} (said once; `.warning` has the state of the last interval)")
 
     def _recorded(self, record: Callable[[list[Row], int], R]) -> list[R]:
-        """The history, of `record(rows, number)` each. Those made before are kept: a loop that reads the last one would
-        take a time that grows with the square of its length."""
+        """The history, of `record(rows, number)` each. Those made before are kept, as loops read the last one."""
         rows = self._history
         self._records += [record(rows, number) for number in range(len(self._records), len(rows))]
         return list(self._records)
@@ -140,9 +141,9 @@ def _remade(
 
 
 def _number(who: str, name: str, value: Any) -> float:
-    """A metric as a float; a tensor of one element is one, and an array without axes."""
-    is_one = isinstance(value, Tensor) and value.numel() == 1
-    return _check.real(who, name, value.item() if is_one or getattr(value, "shape", None) == () else value)
+    """A metric as a float; a tensor or an array of one element is one."""
+    shape = getattr(value, "shape", None)
+    return _check.real(who, name, value.item() if shape is not None and math.prod(shape) == 1 else value)
 
 
 def _checked(who: str, settings: Mapping[str, object], defaults: dict[str, Any]) -> dict[str, Any]:
@@ -238,7 +239,7 @@ class PRDPController(_C.PRDPController, _Attached):
 
 
 class ToleranceController(_C.ToleranceController, _Attached):
-    """Tie the tolerance of the solves to the error of what is trained. Its defaults need no tuning.
+    """Tie the tolerance of the solves to the error of what is trained.
 
     While a network is wrong by a fifth, a solve with a relative residual of a fiftieth is accurate enough. As the
     error falls, the tolerance follows. Use this controller unless you have tuned `PRDPController` for your problem.
@@ -249,7 +250,7 @@ class ToleranceController(_C.ToleranceController, _Attached):
         ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1), 0.1 by default; rtol is 1e-3 before the
             first `step`.
         adjoint_ratio: the rtol of the adjoint solve is rtol / adjoint_ratio, at most 1/2, and its K is
-            ⌈adjoint_ratio·K⌉; in (0, 1], 0.1 by default.
+            ⌈adjoint_ratio·K⌉; in (0, 1], 0.1 by default. Take 1 with a Krylov method without multigrid.
         floor: the smallest rtol; > 0, 1e-5 by default, which solves in float32 reach.
         adjoint_floor: the smallest rtol of the adjoint solve; > 0, 0.01 by default. That rtol is relative to a
             cotangent that shrinks with the error, and a descent needs no better gradient late than early.

@@ -1,6 +1,7 @@
 """What controllers decide by after an interval: how its solves ended, and numbers that all processes agree on."""
 
 import math
+import weakref
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeGuard
 
 import torch
@@ -17,6 +18,23 @@ def all_converged(steppers: list[Refinable]) -> bool:
     """Whether all say so, by a bool of any library: a method, or a value for each sample, is none."""
     said = [getattr(stepper, "converged", None) for stepper in steppers]
     return bool(said) and all((isinstance(x, int) or getattr(x, "shape", None) == ()) and bool(x) for x in said)
+
+
+_LAST: "weakref.WeakKeyDictionary[Any, weakref.ref[Any]]" = weakref.WeakKeyDictionary()  # who set a stepper last
+
+
+def take_over(steppers: list[Refinable], controller: object) -> str | None:
+    """Note who sets these steppers now. What to say if another controller has set one since this one did; else None."""
+    said = None
+    for stepper in steppers:
+        try:
+            last = _LAST.get(stepper, weakref.ref(controller))()
+            _LAST[stepper] = weakref.ref(controller)
+        except TypeError:  # not ours, and of a type that has no weak references, or no hash
+            continue
+        if last is not None and last is not controller:
+            said = f"a {type(last).__name__} sets this {type(stepper).__name__}, too: give a stepper one controller"
+    return said
 
 
 _READ = ("residual", "floor", "iterations", "status")
@@ -71,7 +89,9 @@ class Interval(NamedTuple):
             metric_sum, error_sum, agree, known, idle_sum, *flat = data_parallel.sums(
                 [*numbers, *(number for pair in residuals for number in pair)], group
             )
-            metric, converged, idle = metric_sum / processes, agree == processes, idle_sum / processes
+            refused = not (math.isfinite(metric) and metric >= 0)  # here, which the error is to say
+            metric = metric if refused else metric_sum / processes
+            converged, idle = agree == processes, idle_sum / processes
             error = error_sum / processes if known == processes else None
             residuals = list(zip(flat[::2], flat[1::2], strict=True))
         means = [total / samples for total, samples in residuals if samples]

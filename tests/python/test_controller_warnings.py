@@ -148,3 +148,47 @@ def test_a_warning_points_at_the_call_of_step():
         for metric in range(1, 40):
             controller.step(float(metric))
     assert [warning.filename for warning in said] == [__file__]
+
+
+@pytest.mark.parametrize("first, last", [(0.5, 0.98), (0.1, 0.95)])
+def test_an_accuracy_is_told_from_an_error(first, last):
+    controller = prdp.PRDPController([])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it is said aloud, too
+        for epoch in range(40):
+            controller.step(last + (first - last) * 0.9**epoch)
+    assert "the metric grows" in controller.warning
+    assert controller.warning.endswith("If larger is better, pass 1 - accuracy, or the like")
+
+
+def test_a_metric_that_has_fallen_is_no_accuracy():
+    controller = prdp.PRDPController([])
+    for epoch in range(40):
+        controller.step(0.5 + 0.4 * abs(epoch - 2) / 40)
+    assert controller.warning is None
+
+
+def test_a_stepper_that_another_controller_sets_is_told_of_once(always):
+    heat = heat_step()
+    first, second = prdp.PRDPController([heat], initial=3), prdp.PRDPController([heat], initial=20)
+    with pytest.warns(UserWarning, match="PRDPController: a PRDPController sets this Heat, too: give a stepper one"):
+        first.step(1.0)
+    assert heat.max_iter == 3
+    with pytest.warns(UserWarning, match="sets this Heat, too"):
+        second.step(1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        first.step(1.0)
+        del second
+        prdp.ToleranceController([heat]).step(1.0)  # in place of both
+        other = prdp.ToleranceController([heat])
+        other.step(1.0)
+
+
+def test_an_array_of_one_number_is_a_metric():
+    controller = prdp.ToleranceController([])
+    controller.step(np.array([0.5]))
+    controller.step(torch.tensor([[0.25]]))
+    assert [record.error for record in controller.history] == [0.5, 0.25]
+    with pytest.raises(TypeError, match="error"):
+        controller.step(np.array([0.5, 0.5]))

@@ -17,9 +17,10 @@ constexpr double kShareOfError = 0.3;
 /// Too large for whatever the metric may be.
 constexpr double kLargeResidual = 0.1;
 /// A metric grows where the last `kGrown` of them are more than `kGrowth` times the least; not where all of them are
-/// rounding, next to the largest.
-constexpr size_t kGrown = 3;
-constexpr double kGrowth = 2.0, kRoundingOfMetric = 1e-3;
+/// rounding, next to the largest. One that was never below its first value in `kLong` calls may be an accuracy: there
+/// less growth tells.
+constexpr size_t kGrown = 3, kLong = 20;
+constexpr double kGrowth = 2.0, kGrowthFromFirst = 1.1, kRoundingOfMetric = 1e-3;
 
 bool is_size(double x) { return std::isfinite(x) && x >= 0.0; }
 
@@ -73,14 +74,16 @@ std::string Controller::about_metric() const {
   if (history.size() <= kGrown) return {};
   const auto [least, most] = std::minmax_element(history.begin(), history.end(),
                                                  [](const Record& a, const Record& b) { return a.metric < b.metric; });
-  const double bound = std::max(kGrowth * least->metric, kRoundingOfMetric * most->metric);
+  const bool never_fell = history.size() >= kLong && least == history.begin();
+  const double growth = never_fell ? kGrowthFromFirst : kGrowth;
+  const double bound = std::max(growth * least->metric, kRoundingOfMetric * most->metric);
   const bool grows =
       std::all_of(history.end() - kGrown, history.end(), [&](const Record& r) { return r.metric > bound; });
   if (!grows) return {};
   text << "the " << metric_name() << " grows: " << history.back().metric << " after " << least->metric
        << " in interval " << least - history.begin()
-       << "; lower the learning rate, solve further, or go back to the weights "
-          "of then";
+       << "; lower the learning rate, solve further, or go back to the weights of then";
+  if (never_fell) text << ". If larger is better, pass 1 - accuracy, or the like";
   return text.str();
 }
 

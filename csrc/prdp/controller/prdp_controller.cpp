@@ -68,7 +68,9 @@ bool PRDPController::step(double metric, const Solves& solves) {
 
 void PRDPController::load_state(State state) {
   TORCH_CHECK_VALUE(state.max_iter >= settings_.initial && (!settings_.maximum || state.max_iter <= *settings_.maximum),
-                    "PRDPController: state has max_iter = ", state.max_iter, ", below initial or above maximum");
+                    "PRDPController: state has max_iter = ", state.max_iter,
+                    ", expected >= initial = ", settings_.initial,
+                    settings_.maximum ? c10::str(" and <= maximum = ", *settings_.maximum) : "");
   check_state(state);
   state_ = std::move(state);
 }
