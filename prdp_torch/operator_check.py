@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 from prdp_torch import _C, _check
 from prdp_torch.operators import Operator
 from prdp_torch.operators.base import full_precision, without_autocast
-from prdp_torch.operators.matrix import as_operator
+from prdp_torch.operators.matrix import Matrix, as_operator
 from prdp_torch.solve import linear_solve
 from prdp_torch.solvers import CG, GMRES, MINRES, Solver
 
@@ -23,8 +23,8 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
 
     Args:
         A: an operator of `prdp_torch.operators`, or a tensor as `linear_solve` takes it.
-        example: a right-hand side (batch, ...) in float32 or float64, of which only shape and dtype are used. In
-            float64 the comparison is sharp; in float32 it finds only large mistakes.
+        example: a right-hand side (batch, ...), or (n,) of a matrix, in float32 or float64, of which only shape and
+            dtype are used. In float64 the comparison is sharp; in float32 it finds only large mistakes.
         solver: one that A, and a preconditioner of your own, are to fit, such as `CG(10, preconditioner=M)`.
 
     It checks that:
@@ -53,7 +53,9 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
     """
     who = "check_operator"
     A = as_operator(who, "A", A)
-    if _check.dense(who, "example", example).dim() < 2:
+    if _check.dense(who, "example", example).dim() == 1 and isinstance(A, Matrix):
+        example = example.unsqueeze(0)  # one vector, as linear_solve takes it
+    if example.dim() < 2:
         raise ValueError(f"{who}: example must have shape (batch, ...), got {tuple(example.shape)}")
     if not example.is_floating_point():
         raise TypeError(f"{who}: example must be float32 or float64, got {example.dtype}")

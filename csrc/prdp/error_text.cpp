@@ -31,6 +31,13 @@ std::string three_digits(double x) {
   return text.str();
 }
 
+std::string as_tuple(c10::ArrayRef<int64_t> numbers) {
+  std::ostringstream text;
+  for (size_t i = 0; i < numbers.size(); ++i) text << (i ? ", " : "(") << numbers[i];
+  text << (numbers.size() == 1 ? ",)" : ")");
+  return text.str();
+}
+
 void speak_python() { speaks_python = true; }
 
 const char* in_language(const char* python, const char* cpp) { return speaks_python ? python : cpp; }

@@ -1,4 +1,7 @@
 #pragma once
+#include <c10/util/ArrayRef.h>
+
+#include <cstdint>
 #include <string>
 #include <string_view>
 
@@ -9,6 +12,9 @@ std::string sentence(std::string_view what);
 
 /// A number as messages give it: "1.23", "4e-05".
 std::string three_digits(double x);
+
+/// An index or an offset: "(0, -1)", or "(3,)" for one number.
+std::string as_tuple(c10::ArrayRef<int64_t> numbers);
 
 /// Messages name things as their reader writes them: as in C++ until this is called, then as in Python and scenes.
 void speak_python();

@@ -169,7 +169,7 @@ def test_arguments_are_checked():
         prdp.linear_solve(Diffusion(-torch.ones(1, 4, 4)), torch.ones(1, 1, 4, 4), prdp.CG(3))
     hole = torch.ones(3, 4, 4)
     hole[1, 2, 3] = 0
-    with pytest.raises(ValueError, match=r"kappa must be > 0, got 0 in sample 1 at index \[2, 3\]"):
+    with pytest.raises(ValueError, match=r"kappa must be > 0, got 0 in sample 1 at index \(2, 3\)"):
         prdp.linear_solve(Diffusion(hole), torch.ones(3, 1, 4, 4), prdp.CG(3))
     for wrong, b, got in ((kappa, (4, 5), r"\[1, 4, 4\] and b \[1, 1, 4, 5\]"), (kappa[0], (4, 4), r"\[4, 4\] and b")):
         expected = r"Diffusion: expected kappa \(batch or 1, \*shape\) and b \(batch, channel, \*shape\), got kappa "
@@ -240,7 +240,7 @@ def test_transforms_of_torch_func(of):
 
 def test_a_kappa_that_is_not_positive_is_refused_within_a_transform_as_well():
     b, kappa = torch.ones(2, 1, 4), torch.tensor([[1.0, 1, 1, 1], [1, -1, 1, 1]])
-    with pytest.raises(ValueError, match=r"Diffusion: kappa must be > 0, got -1 in sample 1 at index \[1\]"):
+    with pytest.raises(ValueError, match=r"Diffusion: kappa must be > 0, got -1 in sample 1 at index \(1,\)"):
         torch.func.grad(lambda k: prdp.linear_solve(Diffusion(k), b, prdp.CG(20))[0].sum())(kappa)
 
 

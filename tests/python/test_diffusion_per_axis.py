@@ -146,7 +146,7 @@ def test_mistakes_are_named():
             Diffusion(kappa, per_axis=True, **given)
     kappa = torch.ones(3, 2, 4, 5)
     kappa[1, 1, 2, 3] = -2
-    with pytest.raises(ValueError, match=r"kappa must be > 0, got -2 in sample 1 at index \[1, 2, 3\]"):
+    with pytest.raises(ValueError, match=r"kappa must be > 0, got -2 in sample 1 at index \(1, 2, 3\)"):
         prdp.linear_solve(Diffusion(kappa, per_axis=True), torch.ones(3, 1, 4, 5), prdp.CG(3))
     _, info = prdp.linear_solve(
         Diffusion(kappa, per_axis=True), torch.ones(3, 1, 4, 5), prdp.CG(90), on_failure="return"

@@ -99,7 +99,7 @@ KRYLOV = (
     "|symmetric but not definite to float..: take MINRES)"
 )
 WAYS = {
-    "nan": ("NONFINITE_INPUT", r" at index \((0, )*1\), ",
+    "nan": ("NONFINITE_INPUT", r" at index \(((0, )+1|1,)\), ",
             "the (right-hand side|cotangent) is NaN or Inf there; look at", PAIRS),
     "inf": ("NONFINITE_OPERATOR", r" at index \([\d, ]+\), ", "A is made of a NaN or Inf; look at the state",
             [(m, o) for m, o in PAIRS if o in ("Burgers", "NavierStokes", "Stencil", "Matrix", "CSR")]),
@@ -111,7 +111,8 @@ WAYS = {
              f"r·A r is zero for a residual r(: {KRYLOV}|; take GMRES)",
              [(m, o) for m in ("SteepestDescent", "CG", "BiCGStab") for o in ("Function", "Matrix", "CSR")]),
     "singular": ("BREAKDOWN", r" \(the iterate .*\), ",
-                 "(A is singular; GMRES solves it|.*A is singular, and b lies outside its range[;,].* take a b"
+                 "(A is singular to float64, or nearly so; GMRES solves it"
+                 "|.*A is singular, and b lies outside its range[;,].* take a b"
                  f"|.*{KRYLOV}|r·A r is zero for a residual r; take GMRES)",
                  [(m, o) for m in ("CG", "BiCGStab", "GMRES(3)", "Direct") for o in ("Function", "Matrix", "CSR")]
                  + [(m, o) for m in DIVIDING if m != "Jacobi" for o in ("Matrix", "CSR")]),

@@ -99,7 +99,7 @@ def test_bad_arguments():
     with pytest.raises(TypeError, match=r"check_operator: A must be an operator of prdp_torch.operators, got 3"):
         prdp.check_operator(3, EXAMPLE)
     with pytest.raises(ValueError, match=r"check_operator: example must have shape \(batch, ...\), got \(7,\)"):
-        prdp.check_operator(torch.eye(N), torch.zeros(N))
+        prdp.check_operator(operators.Function(lambda v: v), torch.zeros(N))
 
 
 INVERSE = operators.Function(lambda v: v / 3, symmetric=True)
@@ -169,3 +169,7 @@ def test_one_eigenvalue_of_the_other_sign_is_found_among_many():
                 prdp.check_operator((a + a.mT) / 2, torch.ones(2, n, dtype=torch.float64), prdp.CG(3))
             regular = sign * (q * eigenvalues.abs()) @ q.mT
             assert prdp.check_operator((regular + regular.mT) / 2, torch.ones(2, n, dtype=torch.float64), prdp.CG(3))
+
+
+def test_one_vector_of_a_matrix_is_an_example():
+    assert prdp.check_operator(torch.eye(5, dtype=torch.float64), torch.ones(5, dtype=torch.float64))

@@ -76,7 +76,7 @@ def test_a14_nonfinite_data_is_found_before_iterating(solver):
     bad_b, bad_a = array("A14__b_nan"), array("A14__A_inf")
     where = int(torch.isnan(bad_b).nonzero()[0])
     row, column = torch.isinf(bad_a).nonzero()[0].tolist()
-    with pytest.raises(torch.linalg.LinAlgError, match=rf"sample 0 NONFINITE_INPUT at index \({where}\)"):
+    with pytest.raises(torch.linalg.LinAlgError, match=rf"sample 0 NONFINITE_INPUT at index \({where},\)"):
         prdp.linear_solve(a, bad_b, solver(5))
     with pytest.raises(torch.linalg.LinAlgError, match=rf"sample 0 NONFINITE_OPERATOR at index \({row}, {column}\)"):
         prdp.linear_solve(bad_a, b, solver(5))

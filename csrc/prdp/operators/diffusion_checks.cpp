@@ -10,12 +10,18 @@
 #include "prdp/operators/step_parameters.h"
 #include "prdp/operators/tensors.h"
 
-/// What of a Diffusion is refused.
+/// Which parameters a Diffusion refuses.
 namespace prdp {
 
 namespace {
 
 constexpr const char* kNothingHolds = "neither the shift nor a side holds u, so A is singular";
+
+/// A singular A that is meant.
+std::string singular_if_meant() {
+  return c10::str("; if that is meant, give ", in_language("shift=0.0", "0.0 as shift"),
+                  ", a number, which makes the constant the null space of all samples");
+}
 
 /// Which samples of a number or a field are zero throughout: (batch or 1).
 at::Tensor zero_samples(const at::Tensor& t) {
@@ -125,9 +131,7 @@ void DiffusionOperator::check_robin(Checks checks) const {
 void DiffusionOperator::check_held() const {
   const auto unheld = unheld_samples();
   if (!unheld.defined() || !unheld.any().item<bool>()) return;
-  TORCH_CHECK_VALUE(false, "Diffusion: in sample ", first_true(unheld)[0], " ", kNothingHolds,
-                    "; if that is meant, give ", in_language("shift=0.0", "0.0 as shift"),
-                    ", a number, which makes the constant the null space of all samples");
+  TORCH_CHECK_VALUE(false, "Diffusion: in sample ", first_true(unheld)[0], " ", kNothingHolds, singular_if_meant());
 }
 
 void DiffusionOperator::check_kappa(Checks checks) const {
@@ -136,9 +140,10 @@ void DiffusionOperator::check_kappa(Checks checks) const {
   const auto wrong = kappa_.le(0);
   if (checks == Checks::kShared || !wrong.any().item<bool>()) return;
   const auto index = first_true(wrong);
-  TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ",
-                    kappa_.flatten()[wrong.flatten().to(at::kByte).argmax().item<int64_t>()].item<double>(),
-                    " in sample ", index[0], " at index ", at::IntArrayRef(index).slice(per_axis_ ? 1 : 2));
+  const double value = kappa_.masked_select(wrong)[0].item<double>();
+  TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ", value, " in sample ", index[0], " at index ",
+                    as_tuple(at::IntArrayRef(index).slice(per_axis_ ? 1 : 2)),
+                    value == 0.0 ? "; where nothing flows, give a small number such as 1e-30" : "");
 }
 
 std::optional<DiffusionOperator::Refused> DiffusionOperator::first_refused(int64_t sample) const {
@@ -165,11 +170,12 @@ std::string DiffusionOperator::refusal(int64_t sample) const {
   const auto found = first_refused(sample);
   if (!found) {
     const auto unheld = unheld_samples();
-    return unheld.defined() && unheld[unheld.size(0) == 1 ? 0 : sample].item<bool>() ? kNothingHolds : "";
+    const bool is_unheld = unheld.defined() && unheld[unheld.size(0) == 1 ? 0 : sample].item<bool>();
+    return is_unheld ? kNothingHolds + singular_if_meant() : "";
   }
   if (!std::isfinite(found->value)) return {};
   std::ostringstream text;
-  text << found->must << ", got " << found->value;
+  text << found->must << ", got " << found->value << "; what a network predicts should end in exp or softplus";
   return text.str();
 }
 

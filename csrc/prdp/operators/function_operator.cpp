@@ -33,9 +33,9 @@ at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* na
   return result;
 }
 
-/// Inside an operation of torch, where a solve runs, torch as somebody's product knows it outside: nothing is recorded,
-/// but what the product itself differentiates or maps is, and writes into tensors are counted. What it changes beside
-/// that, such as a mode that it enters, stays.
+/// While it exists, the dispatch state of this thread is that of the user's code, not of the op that we are inside:
+/// nothing is recorded unless the product itself asks for it, and writes into tensors are counted. What the product
+/// changes beside that, such as a mode that it enters, stays.
 class AsOutside {
  public:
   AsOutside() {
@@ -75,10 +75,10 @@ class AsOutside {
 int64_t writes(const at::Tensor& t) { return t.is_inference() ? 0 : static_cast<int64_t>(t._version()); }
 
 /// The arguments of a product, which it must leave as they are.
-class Arguments {
+class UnchangedArguments {
  public:
-  Arguments(const at::Tensor& v, const std::vector<at::Tensor>& tensors, bool compares_numbers)
-      : v_(v), tensors_(tensors), before_(all_writes()), copy_(compares_numbers ? v.clone() : at::Tensor()) {}
+  UnchangedArguments(const at::Tensor& v, const std::vector<at::Tensor>& tensors, bool in_inference_mode)
+      : v_(v), tensors_(tensors), before_(all_writes()), copy_(in_inference_mode ? v.clone() : at::Tensor()) {}
   void check_unchanged(const char* name) const {
     const bool is_unchanged =
         all_writes() == before_ && (!copy_.defined() || at::allclose(v_, copy_, 0.0, 0.0, /*equal_nan=*/true));
@@ -129,7 +129,7 @@ void FunctionOperator::check_vector(const at::Tensor& b) const {
 }
 
 at::Tensor FunctionOperator::apply(const at::Tensor& v) const {
-  if (registered_->looks_for_captures && !at::GradMode::is_enabled()) return product_without_captures(v);
+  if (registered_->looks_for_captures && !at::GradMode::is_enabled()) return product_checking_captures(v);
   return product(registered_->products().apply, v, tensors_, product_name());
 }
 
@@ -149,7 +149,7 @@ bool FunctionOperator::in_transform(const at::Tensor& v) const {
 at::Tensor FunctionOperator::product(const Products::Product& function, const at::Tensor& v,
                                      const std::vector<at::Tensor>& tensors, const char* name) const {
   const bool is_first = v.is_inference() && v.is_cpu() && is_plain(v) && !std::exchange(looked_in_inference_, true);
-  const Arguments arguments(v, tensors, /*compares_numbers=*/is_first);
+  const UnchangedArguments arguments(v, tensors, /*compares_numbers=*/is_first);
   const auto call = [&] {
     if (in_torch_func()) return function(v, tensors);
     const AsOutside as_outside;
@@ -160,7 +160,7 @@ at::Tensor FunctionOperator::product(const Products::Product& function, const at
   return result;
 }
 
-at::Tensor FunctionOperator::product_without_captures(const at::Tensor& v) const {
+at::Tensor FunctionOperator::product_checking_captures(const at::Tensor& v) const {
   const auto result = with_autograd(
       [&] { return product(registered_->products().apply, v.detach(), detached(tensors_), product_name()); });
   check_nothing_is_captured(result);
@@ -269,6 +269,7 @@ at::Tensor FunctionOperator::norm_of(bool transposed) const {
   return norm;
 }
 
+/// Those of which the product with ones is not finite, if one of the tensors is not; all, if none of them is.
 at::Tensor FunctionOperator::nonfinite_samples(const at::Tensor& b) const {
   auto some = at::zeros({}, b.options().dtype(at::kBool));
   bool any_numbers = false;

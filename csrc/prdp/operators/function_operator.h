@@ -35,7 +35,7 @@ class FunctionOperator final : public Operator {
   bool in_transform(const at::Tensor& v) const;
   at::Tensor product(const Products::Product& function, const at::Tensor& v, const std::vector<at::Tensor>& tensors,
                      const char* name) const;
-  at::Tensor product_without_captures(const at::Tensor& v) const;
+  at::Tensor product_checking_captures(const at::Tensor& v) const;
   at::Tensor derivative_transposed(const at::Tensor& v) const;
   /// A v for autograd to record; raises ValueError where it cannot.
   at::Tensor recorded_product(const at::Tensor& v, const std::vector<at::Tensor>& tensors) const;

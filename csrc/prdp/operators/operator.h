@@ -93,7 +93,8 @@ class Operator {
   /// The index of the first NaN or Inf in the tensors of A, or of what counts as one: (i, j) in a matrix, (channel,
   /// *grid) in winds. Empty where an index would say nothing.
   virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
-  /// Why the parameters of a sample are refused though they are finite, "kappa must be > 0, got -1"; or empty.
+  /// Why the parameters of a sample are refused though they are finite, and a remedy: "kappa must be > 0, got -1; …".
+  /// Or empty.
   virtual std::string refusal(int64_t /*sample*/) const { return {}; }
 
   // ---- A in other forms

@@ -2,6 +2,7 @@
 #include <cmath>
 #include <sstream>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/tensors.h"
 
@@ -11,14 +12,6 @@ namespace prdp {
 namespace {
 
 constexpr int64_t kFarthest = 2;
-
-/// "(0, -1)", or "(3,)" for one number.
-std::string as_tuple(at::ArrayRef<int64_t> values) {
-  std::ostringstream text;
-  for (size_t i = 0; i < values.size(); ++i) text << (i ? ", " : "(") << values[i];
-  text << (values.size() == 1 ? ",)" : ")");
-  return text.str();
-}
 
 at::ArrayRef<int64_t> entries(const kernels::Offset& offset, int64_t dim) {
   return {offset.along + 3 - dim, static_cast<size_t>(dim)};

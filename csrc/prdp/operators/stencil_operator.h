@@ -42,10 +42,9 @@ class StencilOperator final : public Operator {
   std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
   std::optional<kernels::FactorKey> key(bool transposed) const override;
 
-  /// The kernels of a stencil of nearest neighbours whose diagonal is, but for rounding, `row_sums` less the other
-  /// coefficients of a point, also those that lead to a zero beyond the grid: their products are row_sums·v and
-  /// differences of neighbours. row_sums: 0-dimensional or (batch or 1, 1, *shape). The coefficients hold as many
-  /// samples.
+  /// Kernels of products with row_sum_i v_i + Σ_k a_k (v_k - v_i), over nearest neighbours k. row_sums: the diagonal
+  /// plus all coefficients of a point, also those that lead to a zero beyond the grid; 0-dimensional or (batch or 1, 1,
+  /// *shape). The coefficients hold as many samples.
   std::shared_ptr<const kernels::Kernels> kernels_by_differences(const at::Tensor& b, const at::Tensor& row_sums) const;
   OperatorSpec spec() const;
   /// Of A, or of Aᵀ, the diagonal and what couples a point to those before and behind it along each axis, (batch or 1,

@@ -29,6 +29,12 @@ std::string name_of(const Solver& solver) {
 
 bool all_finite(const at::Tensor& t) { return t.isfinite().all().item<bool>(); }
 
+/// M⁻¹ times a vector of ones, of a preconditioner of the user's own; undefined for others.
+at::Tensor preconditioned_ones(const FailedSample& sample) {
+  if (!sample.preconditioner().is_operator()) return {};
+  return sample.of(make_operator(sample.preconditioner().spec())->apply(at::ones_like(sample.b)));
+}
+
 /// ‖A‖ of the sample; zero if nobody knows it, as of a function.
 double operator_norm(const FailedSample& sample) {
   const auto norm = sample.a.norm();
@@ -59,24 +65,23 @@ std::string badly_scaled(const FailedSample& sample) {
 
 /// A preconditioner of the user's own hands out NaN or Inf.
 std::string nonfinite_preconditioner(const FailedSample& sample) {
-  if (!sample.preconditioner().is_operator()) return {};
-  const auto m = make_operator(sample.preconditioner().spec());
-  if (all_finite(sample.of(m->apply(at::ones_like(sample.b))))) return {};
+  const auto m = preconditioned_ones(sample);
+  if (!m.defined() || all_finite(m)) return {};
   return "its preconditioner hands out NaN or Inf for a vector of ones; look at what M⁻¹ is made of";
 }
 
 /// The factors of a diffusion lose what `Direct` needs of it (Kernel::has_definite_factors).
 std::string lost_in_factors(const FailedSample& sample) {
-  const bool nothing_holds_u = is_singular(sample.role.a);
-  if (!sample.method().is_direct || !sample.is_diffusion() || nothing_holds_u) return {};
+  const bool null_space_is_named = is_singular(sample.role.a);
+  if (!sample.method().is_direct || !sample.is_diffusion() || null_space_is_named) return {};
   const auto sizes = [&](const at::Tensor& v) { return v.to(at::kDouble).abs(); };
   const auto diagonal = sizes(sample.of(sample.a.diagonal())), row_sums = sizes(sample.row_sums());
   if ((diagonal.max() / diagonal.min()).item<double>() >= kernels::kWidestRowsOfFactors)
     return "κ differs by more than a factor of 1e13, beyond what factors in float64 hold; bring its largest and its "
            "smallest value nearer to each other";
   if ((diagonal.sum() / row_sums.sum()).item<double>() >= kernels::kWidestRowsOfFactors)
-    return "what holds u, a shift or the sides, is 1e13 times smaller than κ/dx², beyond what factors in float64 hold; "
-           "make κ smaller or the shift larger";
+    return "the shift and the sides that hold u are 1e13 times smaller than κ/dx², beyond what factors in float64 "
+           "hold; make κ smaller or the shift larger";
   return {};
 }
 
@@ -88,9 +93,8 @@ bool row_sums_are_rounding(const FailedSample& sample) {
 
 /// Whether a preconditioner of the user's own hands out nothing.
 bool maps_ones_to_zero(const FailedSample& sample) {
-  if (!sample.preconditioner().is_operator()) return false;
-  const auto m = make_operator(sample.preconditioner().spec());
-  return !sample.of(m->apply(at::ones_like(sample.b))).any().item<bool>();
+  const auto m = preconditioned_ones(sample);
+  return m.defined() && !m.any().item<bool>();
 }
 
 /// Why a method for symmetric definite operators fails on this one.
@@ -105,7 +109,7 @@ std::string not_definite(const FailedSample& sample) {
 }
 
 /// Why MINRES finds no direction.
-std::string not_minimal(const FailedSample& sample) {
+std::string minres_breakdown(const FailedSample& sample) {
   if (auto found = nonfinite_preconditioner(sample); !found.empty()) return found;
   if (sample.preconditioner())
     return c10::str(
@@ -156,10 +160,9 @@ std::string overflow(const FailedSample& sample) {
 }
 
 std::string direct_breakdown(const FailedSample& sample) {
-  const char* where =
-      sample.is_single() ? " to float32, or nearly so; take float64. If it is singular there, too," : ";";
-  return c10::str("A is singular", where,
-                  " GMRES solves it for any b in the range of A, and Direct where all null vectors are named");
+  return c10::str("A is singular to ", sample.precision(), ", or nearly so; ",
+                  sample.is_single() ? "take float64; if it is singular there, too, " : "",
+                  "GMRES solves it for any b in the range of A, and Direct where all null vectors are named");
 }
 
 std::string definite_breakdown(const FailedSample& sample) {
@@ -176,7 +179,7 @@ std::string definite_breakdown(const FailedSample& sample) {
 std::string breakdown(const FailedSample& sample) {
   if (sample.method().is_direct) return direct_breakdown(sample);
   if (sample.method().made_for == MadeFor::kDefinite) return definite_breakdown(sample);
-  if (sample.method().made_for == MadeFor::kSymmetric) return not_minimal(sample);
+  if (sample.method().made_for == MadeFor::kSymmetric) return minres_breakdown(sample);
   if (maps_ones_to_zero(sample)) return "its preconditioner maps a vector of ones to zero; look at what M⁻¹ is made of";
   if (sample.method().counts == Counts::kIterations) return "r·A r is zero for a residual r; take GMRES";
   const char* remedy = sample.is_single() ? "float32; take float64 to tell, or" : "float64; if it is singular, take";
@@ -206,7 +209,7 @@ std::string stagnated(const FailedSample& sample) {
 }
 
 /// Why max_iter left a large residual.
-std::string stopped(const FailedSample& sample) {
+std::string max_iter_reached(const FailedSample& sample) {
   if (auto found = unfit(sample); !found.empty()) return found;
   const bool single = sample.is_single();
   if (loses_coarse_grids(sample)) return kLostCoarseGrids;
@@ -225,9 +228,8 @@ const char* zero_on_diagonal(const FailedSample& sample) {
   if (sample.of(sample.a.diagonal()).eq(0).any().item<bool>())
     return "it divides by the diagonal of A, which has a zero there";
   if (sample.preconditioner().is_multigrid() || sample.solver().method == Method::kMultigrid)
-    return "multigrid finds no coarse grid for A: a diagonal vanishes, or a number leaves the range of the dtype, on "
-           "one "
-           "of them";
+    return "multigrid finds no coarse grid for A: on one of them a diagonal vanishes, or a number leaves the range of "
+           "the dtype";
   return "it divides by the diagonal of A, whose least number is lost beside the largest";
 }
 
@@ -249,8 +251,7 @@ std::string nonfinite_input(const FailedSample& sample) {
 }
 
 std::string nonfinite_operator(const FailedSample& sample) {
-  const auto refused = sample.a.refusal(sample.index);
-  if (!refused.empty()) return refused + "; what a network predicts should end in exp or softplus";
+  if (auto refused = sample.a.refusal(sample.index); !refused.empty()) return refused;
   return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
 }
 
@@ -276,8 +277,8 @@ std::string cause_of(const FailedSample& sample, SolveStatus status) {
     case SolveStatus::kNonfiniteInput: return nonfinite_input(sample);
     case SolveStatus::kNonfiniteOperator: return nonfinite_operator(sample);
     case SolveStatus::kStagnated: return stagnated(sample);
-    case SolveStatus::kMaxIter: return stopped(sample);
-    default: return "it did not reach its tolerance; raise max_iter or rtol";
+    case SolveStatus::kMaxIter: return max_iter_reached(sample);
+    default: TORCH_INTERNAL_ASSERT(false, "a solved sample needs no diagnosis");
   }
 }
 

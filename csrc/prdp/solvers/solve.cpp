@@ -128,7 +128,7 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   last_way = way;
   // Left out after a kernel that nobody waits for: on a GPU it takes some sixty operations of torch.
   const bool is_awaited = request.may_wait || found->info.status.is_cpu() || way != Way::kKernel;
-  if (is_awaited) find_inconsistent_constants(a, b, request, *found);
+  if (is_awaited) mark_inconsistent_constants(a, b, request, *found);
   return *std::move(found);
 }
 

@@ -25,12 +25,12 @@ at::Tensor constant_shares(const at::Tensor& v) {
   return at::where(part <= subnormal_rounding(scale, v), 0.0, part / whole);
 }
 
-/// Of a solve: with fewer than few, rounding has hardly grown along a null space; beside many, the products that tell
-/// of one cost little.
+/// In fewer products than kFewProducts, rounding has hardly grown along a null space. After kManyProducts, those that
+/// tell whether there is one cost little beside the solve.
 constexpr int64_t kFewProducts = 32, kManyProducts = 256;
 
 /// Whether rounding may grow in few products.
-bool has_cycles(const Solver& solver) {
+bool rounding_grows_fast(const Solver& solver) {
   const auto& m = solver.preconditioner;
   return solver.method == Method::kMultigrid || (m && !m.is_diagonal()) || traits(solver.method).is_direct;
 }
@@ -43,7 +43,7 @@ at::Tensor suspects_of(const SolveInfo& info, const SolveRequest& request) {
     const int64_t products = solver.max_iter.expect_int() * traits(solver.method).products;
     const auto unsolved = info.status.eq(static_cast<int64_t>(SolveStatus::kMaxIter))
                               .logical_or(info.status.eq(static_cast<int64_t>(SolveStatus::kStagnated)));
-    const bool worked = has_cycles(solver) || products >= kFewProducts;
+    const bool worked = rounding_grows_fast(solver) || products >= kFewProducts;
     return !worked || (request.may_wait && !unsolved.any().item<bool>()) ? at::Tensor() : unsolved;
   }
   const int64_t batch = info.status.size(0);
@@ -56,7 +56,7 @@ at::Tensor suspects_of(const SolveInfo& info, const SolveRequest& request) {
   at::Tensor suspects;
   for (int64_t i = 0; i < batch; ++i) {
     if (!is_unsolved(static_cast<SolveStatus>(status[i]))) continue;
-    if (!has_cycles(solver) && products[i] < kFewProducts && !is_above_b(i)) continue;
+    if (!rounding_grows_fast(solver) && products[i] < kFewProducts && !is_above_b(i)) continue;
     if (!suspects.defined()) suspects = at::zeros({batch}, at::kBool);
     suspects.mutable_data_ptr<bool>()[i] = true;
   }
@@ -83,27 +83,27 @@ at::Tensor maps_constant_to_zero(const Operator& a, const at::Tensor& b, bool tr
   return share.flatten(1).square().mean(1).sqrt() <= 32.0 * epsilon_of(b);
 }
 
-void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const SolveRequest& request,
+void mark_inconsistent_constants(const Operator& a, const at::Tensor& b, const SolveRequest& request,
                                  SolveResult& result) {
   if (!request.guarded || !a.may_be_singular()) return;
   auto& info = result.info;
   auto suspects = suspects_of(info, request);
   if (!suspects.defined()) return;
   const at::NoGradGuard no_grad;
-  const auto none = [&] { return info.status.is_cpu() && !suspects.any().item<bool>(); };
-  const auto shares = [&](const at::Tensor& v) { return constant_shares(v).to(info.status.device()); };
+  const auto none_left = [&] { return info.status.is_cpu() && !suspects.any().item<bool>(); };
+  const auto constant_share = [&](const at::Tensor& v) { return constant_shares(v).to(info.status.device()); };
   const auto residual = info.residual.to(at::kDouble);
   // No u takes the constant part of b off the residual. A half leaves room for rounding.
-  const auto of_b = shares(b.detach());
-  suspects = suspects & (of_b > 64.0 * epsilon_of(b)) & (residual >= 0.5 * of_b);
-  if (none()) return;
+  const auto share_of_b = constant_share(b.detach());
+  suspects = suspects & (share_of_b > 64.0 * epsilon_of(b)) & (residual >= 0.5 * share_of_b);
+  if (none_left()) return;
   if (!traits(request.solver.method).is_direct) {
     // The products that tell it are dear beside few others. There, u must look as if it had grown along a constant, or
     // the solve must have gone wrong.
     suspects = suspects & ((info.operator_applications >= kManyProducts) |
                            info.status.eq(static_cast<int64_t>(SolveStatus::kStagnated)) | (residual > 1.0) |
-                           shares(result.u).le(0.9).logical_not());
-    if (none()) return;
+                           constant_share(result.u).le(0.9).logical_not());
+    if (none_left()) return;
   }
   const auto found =
       suspects & maps_constant_to_zero(a, b, /*transposed=*/true, /*jointly=*/true).to(suspects.device());

@@ -13,7 +13,7 @@ at::Tensor maps_constant_to_zero(const Operator& a, const at::Tensor& b, bool tr
 /// Marks an unsolved sample INCONSISTENT if Aᵀ maps the constant to zero, no null space was named, and b has a constant
 /// part above rounding. Its u is of no use: what rounding adds along the null space of A grows from iteration to
 /// iteration. The products that tell it are spent where a solve took hundreds, or where u looks like that.
-void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const SolveRequest& request,
+void mark_inconsistent_constants(const Operator& a, const at::Tensor& b, const SolveRequest& request,
                                  SolveResult& result);
 
 }  // namespace prdp

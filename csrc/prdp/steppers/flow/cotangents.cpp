@@ -6,6 +6,7 @@
 #include <limits>
 
 #include "prdp/autograd/solve_vjp.h"
+#include "prdp/error_text.h"
 #include "prdp/operators/operator.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/report_failures.h"
@@ -22,7 +23,7 @@ void report_nonfinite(const at::Tensor& bar, const at::Tensor& refused, OnFailur
     return warn_of_lost_cotangents("Flow: adjoint step", samples.size(0), bar.size(0));
   const auto first = samples[0].item<int64_t>();
   raise_or_warn(c10::str("Flow: adjoint step: ", samples.size(0), " of ", bar.size(0), " samples failed: sample ",
-                         first, " NONFINITE_INPUT at index ", at::IntArrayRef(first_true(nonfinite(bar[first]))),
+                         first, " NONFINITE_INPUT at index ", as_tuple(first_true(nonfinite(bar[first]))),
                          ": the cotangent is NaN or Inf there; look at the loss, at the scale of a GradScaler, or at "
                          "the steps after this one"),
                 on_failure);

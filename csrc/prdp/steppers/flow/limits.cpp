@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/operator.h"
 #include "prdp/solvers/status.h"
 #include "prdp/solvers/warnings.h"
@@ -25,7 +26,7 @@ double largest_courant_number(const FlowEquation& e) {
 /// What is not finite in sample i: the inflow that makes the boundary values of u, the force, a wall, or u.
 std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i) {
   const auto said = [](const std::string& name, const at::Tensor& bad) {
-    return c10::str(name, " is not finite at index ", at::IntArrayRef(first_true(bad)));
+    return c10::str(name, " is not finite at index ", as_tuple(first_true(bad)));
   };
   std::vector<std::pair<std::string, at::Tensor>> given{{"inflow", e.inflow}, {"force", e.force}};
   for (size_t k = 0; k < e.wall_velocity.size(); ++k)
