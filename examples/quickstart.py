@@ -10,7 +10,7 @@ exact = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Direct())
 u1 = exact(u0)
 u2 = exact(u1)
 
-heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1000))  # a cap; the controller sets rtol
+heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1000))
 network = torch.nn.Sequential(torch.nn.Linear(30, 64), torch.nn.ReLU(), torch.nn.Linear(64, 30))
 optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
 controller = prdp.ToleranceController([heat])

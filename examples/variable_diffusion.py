@@ -26,7 +26,7 @@ observed = prdp.ImplicitStep(diffusion(true), solver=prdp.CG(max_iter=1000)).rol
 
 log_kappa = torch.nn.Parameter(torch.full((n, n), 0.02).log())
 operator: prdp.operators.Stencil  # made anew in every update
-step = prdp.ImplicitStep(lambda u: operator, solver=prdp.CG(max_iter=1000))  # a cap; the controller sets rtol
+step = prdp.ImplicitStep(lambda u: operator, solver=prdp.CG(max_iter=1000))
 controller = prdp.ToleranceController([step])
 optimiser = torch.optim.Adam([log_kappa], lr=0.05)
 for _ in range(epochs):
