@@ -27,11 +27,10 @@ def take_over(steppers: list[Refinable], controller: object) -> str | None:
     """Note who sets these steppers now. What to say if another controller has set one since this one did; else None."""
     said = None
     for stepper in steppers:
-        try:
-            last = _LAST.get(stepper, weakref.ref(controller))()
-            _LAST[stepper] = weakref.ref(controller)
-        except TypeError:  # not ours, and of a type that has no weak references, or no hash
+        if not isinstance(stepper, torch.nn.Module):  # others may be equal, or have no weak references
             continue
+        last = _LAST.get(stepper, weakref.ref(controller))()
+        _LAST[stepper] = weakref.ref(controller)
         if last is not None and last is not controller:
             said = f"a {type(last).__name__} sets this {type(stepper).__name__}, too: give a stepper one controller"
     return said

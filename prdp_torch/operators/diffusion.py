@@ -189,9 +189,10 @@ class Diffusion(Operator):
 
 
 def _in_series(a: Tensor, b: Tensor) -> Tensor:
-    """a b/(a + b) for a > 0 and b >= 0, of which autograd makes derivatives without a difference."""
-    flows = b > 0
-    return torch.where(flows, 1 / (1 / a + 1 / torch.where(flows, b, 1.0)), b)
+    """a b/(a + b) for a > 0 and b >= 0, of which autograd makes derivatives that neither cancel nor overflow."""
+    b_is_smaller = b <= a
+    smaller, larger = torch.where(b_is_smaller, b, a), torch.where(b_is_smaller, a, b)
+    return smaller / (1 + smaller / larger)
 
 
 def _kind(side: Any) -> Any:

@@ -115,3 +115,16 @@ def test_hessian_vector_products_of_a_singular_operator_in_every_order(mean):
     ):
         torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
     assert expected.norm() > 1e-2
+
+
+@pytest.mark.parametrize("on_failure", ["return", "zero_grad"])
+def test_a_refused_matrix_with_a_pattern_of_its_own_leaves_its_neighbours_their_gradient(on_failure):
+    crow, col = torch.tensor([[0, 1, 2]] * 2), torch.tensor([[0, 1]] * 2)
+    values = torch.tensor([[2.0, 3.0], [float("nan"), 3.0]], dtype=F64)
+
+    def loss(values):
+        a = operators.Matrix.csr(crow, col, values, (2, 2, 2))
+        return prdp.linear_solve(a, torch.ones(2, 2, dtype=F64), prdp.GMRES(9), on_failure=on_failure)[0].sum()
+
+    expected = torch.tensor([[-1 / 4, -1 / 9], [0.0, 0.0]], dtype=F64)
+    torch.testing.assert_close(grad(loss)(values), expected, rtol=1e-8, atol=0)

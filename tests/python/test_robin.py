@@ -217,3 +217,21 @@ def test_what_autograd_records_of_a_robin_side_is_its_product_rule(h):
     for mine, other in zip(rule, recorded, strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-12, atol=1e-30)
     torch.testing.assert_close(tangents[0], rule[1], rtol=1e-12, atol=1e-30)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("h", [0.0, 1e-30, 1e-20, 0.7, 8.0, 1e20])
+def test_derivatives_of_a_side_in_series_at_any_h(h, dtype):
+    """Of a h/(a + h)/w, with a = 2κ/w for κ = 1 in four cells of width w; h = 8 is a tie."""
+    a, w = 8.0, 0.25
+    h = torch.tensor(h, dtype=dtype, requires_grad=True)
+    given = Diffusion(torch.ones(1, 4, dtype=dtype), 1.0, boundary=[("flux", ("robin", h))])
+    for c in (
+        given.boundary_rhs(values=[(None, 1.0)])[0, 0, -1],
+        given.apply(torch.ones(1, 1, 4, dtype=dtype))[0, 0, -1],
+    ):
+        (first,) = torch.autograd.grad(c, h, create_graph=True)
+        (second,) = torch.autograd.grad(first, h)
+        size = a / (a + h.item())
+        assert float(first.detach()) == pytest.approx(size**2 / w, rel=1e-5, abs=1e-36)
+        assert float(second.detach()) == pytest.approx(-2 * size**2 / (a + h.item()) / w, rel=1e-5, abs=1e-36)

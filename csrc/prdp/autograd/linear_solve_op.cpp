@@ -182,6 +182,7 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
   auto result = solve(*a, rhs,
                       {.solver = s,
                        .x0 = x0,
+                       .whole_cycles = options.backward == Backward::kUnrolled,
                        .may_wait = may_wait,
                        .checks = checks,
                        .report_apart = options.report_apart,

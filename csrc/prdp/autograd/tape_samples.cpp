@@ -63,7 +63,7 @@ void reverse_sample(const SystemWithTranspose<T>& pair, ThreadMemory<T>& memory,
   values.load(b, scale, values.b());
   values.project(values.b());
   values.take_b();
-  state.set_b2(values.b2(), batch.solver.rtol);
+  state.b2 = values.b2();
   if (batch.x0) start_from(values, batch.x0 + s * n);
   tape.begin();
   TapeSpace<T> space(tape, values);

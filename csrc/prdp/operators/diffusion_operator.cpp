@@ -36,12 +36,12 @@ at::Tensor or_nan(const at::Tensor& t, const at::Tensor& allowed) {
   return t.masked_fill(allowed.logical_not(), std::numeric_limits<double>::quiet_NaN());
 }
 
-/// Of two conductances a > 0 and b >= 0 in series, a b/(a + b). Of the reciprocals autograd makes a²/(a + b)² and
-/// b²/(a + b)²; of the quotient it would make differences, of which float32 leaves nothing where b is large.
+/// Of two conductances a > 0 and b >= 0 in series, a b/(a + b), as s/(1 + s/l) of the smaller and the larger one: what
+/// autograd makes of that neither cancels, where a quotient by a + b does, nor overflows.
 at::Tensor in_series(const at::Tensor& a, const at::Tensor& b) {
-  const auto flows = b.gt(0);
-  const auto sum = (a.reciprocal() + at::where(flows, b, 1.0).reciprocal()).reciprocal();
-  return at::where(flows, sum, b);
+  const auto b_is_smaller = b.le(a);
+  const auto smaller = at::where(b_is_smaller, b, a), larger = at::where(b_is_smaller, a, b);
+  return smaller / (1.0 + smaller / larger);
 }
 
 /// Summed over the samples where these share one.

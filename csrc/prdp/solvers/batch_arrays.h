@@ -28,7 +28,7 @@ struct GivenSample {
   T magnitude;  // of b
   int64_t cap;
   double rtol;
-  bool guarded;
+  bool guarded, whole_cycles;
 };
 
 template <class T>
@@ -39,7 +39,7 @@ struct BatchArrays {
   ReportArrays<T> report;
   int64_t max_iter;
   double rtol;
-  bool guarded;
+  bool guarded, whole_cycles;
 
   /// `magnitude`: of its b.
   GivenSample<T> sample(int64_t s, int64_t unknowns, T magnitude) const {
@@ -50,7 +50,8 @@ struct BatchArrays {
             .magnitude = magnitude,
             .cap = caps ? caps[s] : max_iter,
             .rtol = rtol,
-            .guarded = guarded};
+            .guarded = guarded,
+            .whole_cycles = whole_cycles};
   }
 };
 

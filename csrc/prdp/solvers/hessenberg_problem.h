@@ -32,14 +32,15 @@ class HessenbergProblem {
     exhausted_ = numbers_.is_zero(residual2);
     scale_ = residual2 * 0;
     enough2_ = enough2;
-    return is_first_ = numbers_.is_zero(scale_);
+    cycles_ = 0;
+    return numbers_.is_zero(scale_);
   }
-  void leave_first() { is_first_ = is_first_ * 0; }
+  /// The next cycle is not the first.
+  void leave_first() { cycles_ = 1; }
   /// Begins a cycle with v₀ = r/‖r‖.
   void begin(const Scalar& length) {
     columns_[0].g = length;
-    enough2_ = enough2_ * is_first_;
-    leave_first();
+    ++cycles_;
     solved2_ = length * length * kSolved2;
     columns_[0].inverse_length = numbers_.inverse(length, length);
     exhausted_ = numbers_.is_zero(length);
@@ -50,13 +51,17 @@ class HessenbergProblem {
   PRDP_NOINLINE void add_column(int64_t j, const Scalar& length) {
     scale_ = numbers_.larger(scale_, length);
     // At sixteen units the space counts as exhausted, and goes on; at one, it ends.
-    exhausted_ = exhausted_ + vanishes(h(j + 1, j), scale_) * numbers_.is_not_zero(columns_[j].inverse_length);
+    Scalar vanished = vanishes(h(j + 1, j), scale_);
+    if (cycles_ == 1) vanished = vanished * numbers_.is_not_zero(columns_[j].inverse_length);  // it may have ended
+    exhausted_ = exhausted_ + vanished;
     h(j + 1, j) = h(j + 1, j) * is_above(h(j + 1, j), scale_ * kOneUnit);
     const Scalar next = h(j + 1, j);
     rotate(j);
     const Scalar g = columns_[j + 1].g;  // ±the least residual so far
-    const Scalar is_enough = numbers_.is_larger(enough2_, g * g);
-    columns_[j + 1].inverse_length = numbers_.inverse(next, rounding(g)) * numbers_.is_zero(is_enough);
+    columns_[j + 1].inverse_length = numbers_.inverse(next, rounding(g));
+    if (cycles_ > 1) return;
+    const Scalar goes_on = numbers_.is_zero(numbers_.is_larger(enough2_, g * g));
+    columns_[j + 1].inverse_length = columns_[j + 1].inverse_length * goes_on;
   }
   /// Where y takes a step so long that its rounding exceeds ‖r‖ = size, A is singular to the dtype, and y is damped.
   PRDP_NOINLINE void minimise(int64_t columns, const Scalar& size, const Scalar& one) {
@@ -155,7 +160,8 @@ class HessenbergProblem {
   ArrayOf<Numbers, Scalar> rhs_, damped_;  // of damp()
   Scalar exhausted_{}, scale_{};
   Scalar solved2_{};  // ‖r‖² of a cycle that solves
-  Scalar enough2_{}, is_first_{};
+  Scalar enough2_{};
+  int64_t cycles_ = 0;  // begun
 };
 
 }  // namespace prdp

@@ -102,6 +102,7 @@ class JacobiMethod {
 template <SweepingSpace Space>
 class ChebyshevMethod : public JacobiMethod<Space> {
  public:
+  static constexpr bool kOscillates = true;
   explicit ChebyshevMethod(Space& space) : JacobiMethod<Space>(space, /*accelerated=*/true) {}
 
   auto iteration_state() { return std::tie(this->x, this->next_); }

@@ -12,6 +12,10 @@ inline constexpr bool kMayExhaust = requires(const Method& m) { m.exhausted(); }
 template <class Method>
 inline constexpr bool kTakesStrides = requires(Method& m, int64_t n) { m.step(n); };
 
+/// Methods whose residual may rise and fall for long on its way down.
+template <class Method>
+inline constexpr bool kOscillates = requires { Method::kOscillates; };
+
 /// Methods that update their residual by a recursion, and go on from the true one once it is recomputed.
 template <class Method>
 inline constexpr bool kHasRecursiveResidual = requires { Method::kHasRecursiveResidual; };

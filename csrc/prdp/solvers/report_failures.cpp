@@ -25,19 +25,20 @@ struct Report {
   const SolveRole& role;
   const Operator& a;
   const at::Tensor& b;
-  std::vector<int64_t> statuses, iterations, products;
-  std::vector<double> residuals, floors;
+  const SolveInfo& info;
+  std::vector<int64_t> statuses, iterations;
+  std::vector<double> residuals;
 
   Report(const SolveRole& of, const Operator& a, const at::Tensor& b, const SolveInfo& info)
       : role(of),
         a(a),
         b(b),
+        info(info),
         statuses(to_host<int64_t>(info.status, b.size(0))),
         iterations(to_host<int64_t>(info.iterations, b.size(0))),
-        products(to_host<int64_t>(info.operator_applications, b.size(0))),
-        residuals(to_host<double>(info.residual, b.size(0))),
-        floors(to_host<double>(info.floor, b.size(0))) {}
+        residuals(to_host<double>(info.residual, b.size(0))) {}
 
+  std::vector<double> floors() const { return to_host<double>(info.floor, batch()); }
   int64_t batch() const { return b.size(0); }
   double rtol() const { return role.solver.rtol; }
   SolveStatus status(int64_t i) const { return static_cast<SolveStatus>(statuses[i]); }
@@ -97,10 +98,11 @@ std::string whereabouts(const Report& report, int64_t sample) {
 /// rounding leaves of a u that is good enough, but nobody else would say that it may not be. Returns whether there are
 /// any.
 bool warn_of_stagnation(const Report& report) {
+  const auto floors = report.floors();
   const auto stagnated = report.samples_where([&](int64_t i) {
     // Where residual and floor are equal, u consists of the least numbers of its dtype, and that is their rounding.
     return report.status(i) == SolveStatus::kStagnated && report.residuals[i] > report.large_residual() &&
-           report.residuals[i] != report.floors[i];
+           report.residuals[i] != floors[i];
   });
   if (stagnated.empty()) return false;
   const int64_t worst = report.worst_of(stagnated);
@@ -177,8 +179,9 @@ void warn_of_unfit(const Report& report, const std::vector<int64_t>& unsolved) {
   if (!(solver.rtol > 0.0) || steps_of(solver.method, solver.max_iter.expect_int(), solver.restart) < many_products)
     return;
   if (!should_look(report.key())) return;
-  const int64_t worst = report.worst_of(unsolved), products = report.products[worst];
-  const double bound = 10.0 * std::max(solver.rtol, report.floors[worst]);
+  const int64_t worst = report.worst_of(unsolved);
+  const auto products = report.info.operator_applications[worst].item<int64_t>();
+  const double bound = 10.0 * std::max(solver.rtol, report.info.floor[worst].item<double>());
   if (static_cast<double>(products) < many_products || !(report.residuals[worst] > bound)) return;
   if (unfit({report.role, report.a, report.b, worst}).empty()) return;
   report.warn("unfit: ", unsolved.size(), worst, SolveStatus::kMaxIter, [&](std::ostream& text) {
@@ -215,13 +218,22 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad)
     return look_for_lost_cotangents(role, info);
   const auto on_host = info.status.to(at::kCPU);
-  const auto* status = on_host.const_data_ptr<int64_t>();
-  if (std::all_of(status, status + b.size(0), [](int64_t s) { return is_solved(static_cast<SolveStatus>(s)); })) return;
+  const auto* first = on_host.const_data_ptr<int64_t>();
+  const auto any_is = [&](auto... wanted) {
+    return std::any_of(first, first + b.size(0),
+                       [&](int64_t s) { return (wanted(static_cast<SolveStatus>(s)) || ...); });
+  };
+  const auto is_stagnated = [](SolveStatus s) { return s == SolveStatus::kStagnated; };
+  const bool asks_for_tolerance = role.solver.rtol > 0.0;  // else MAX_ITER is what was asked for
+  if (asks_for_tolerance ? !any_is([](SolveStatus s) { return !is_solved(s); })
+                         : !any_is([](SolveStatus s) { return is_failure(s); }, is_stagnated))
+    return;
   const Report report(role, a, b, info);
   const auto failed = report.samples_where([&](int64_t i) { return is_failure(report.status(i)); });
   if (failed.empty()) {
     const auto unsolved = report.samples_where([&](int64_t i) { return !is_solved(report.status(i)); });
-    const bool have_stopped = warn_of_stopped(report), have_stagnated = warn_of_stagnation(report);
+    const bool have_stopped = warn_of_stopped(report);
+    const bool have_stagnated = any_is(is_stagnated) && warn_of_stagnation(report);
     if (!have_stopped && !have_stagnated) warn_of_unfit(report, unsolved);
     return;
   }

@@ -32,7 +32,8 @@ double slack_of_floor(const SampleState& s, double rtol, double floor) {
   if (s.status == SolveStatus::kBreakdown) return 100.0;
   const double target = rtol * std::sqrt(s.b2);
   if (kIsExact<Method>) return target <= 32.0 * floor ? 32.0 : 1.0;
-  return target <= floor || is_idle<Method>(s) ? 8.0 : 1.0;
+  const bool gains_nothing = !kOscillates<Method> && is_idle<Method>(s);
+  return target <= floor || gains_nothing ? 8.0 : 1.0;
 }
 
 /// The floor of each `doubtful` sample whose residual is at most slack_of_floor() floors; 0 for the others. Never of a

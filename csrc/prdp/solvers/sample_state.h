@@ -27,7 +27,7 @@ enum class Returned {
 struct SampleState {
   int64_t cap = 0;         // iterations allowed
   double b2 = 0.0;         // ‖b‖²
-  double enough2 = 0.0;  // a residual² at which a cycle need not go on: a tenth of rtol ‖b‖, to be safe from rounding
+  double enough2 = 0.0;    // a residual² at which the first cycle may end
   bool active = true;  // still iterating; a frozen sample's u no longer changes
   bool candidate = false;  // its residual has just come below rtol, to be confirmed
   bool concluded = false;  // residual2 is the true one of the last iterate, and conclude() leaves the sample alone
@@ -48,10 +48,8 @@ struct SampleState {
   double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
   Returned returned = Returned::kLast;
 
-  void set_b2(double norm2, double rtol) {
-    b2 = norm2;
-    enough2 = 0.01 * rtol * rtol * norm2;
-  }
+  /// Lets the first cycle end once the estimate of its residual is a tenth of rtol ‖b‖: rounding moves it less.
+  void end_cycles_at(double rtol) { enough2 = 0.01 * rtol * rtol * b2; }
   void note(double fresh2) {
     residual2 = fresh2;
     if (!(fresh2 < best2)) return;

@@ -18,6 +18,9 @@ struct SolveRequest {
   std::optional<at::Tensor> caps{};
   bool guarded = true;
   at::Tensor x0{};
+  /// Whether no cycle of GMRES ends early: those that are differentiated iteration by iteration, as the derivative of
+  /// the last products is rounding.
+  bool whole_cycles = false;
   /// Whether the host may wait for another device to read the report there; the kernels of solve_on_gpu.h never wait.
   bool may_wait = true;
   /// What of A is looked at where a kernel of a GPU was to look, and none runs.
@@ -54,7 +57,8 @@ BatchArrays<T> arrays_of(const SolveRequest& request, const at::Tensor& b, const
                      .floor = info.floor.mutable_data_ptr<T>()},
           .max_iter = request.solver.max_iter.expect_int(),
           .rtol = request.solver.rtol,
-          .guarded = request.guarded};
+          .guarded = request.guarded,
+          .whole_cycles = request.whole_cycles};
 }
 
 /// How the last solve of this thread was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors";

@@ -64,7 +64,7 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   const auto b2 = space.values_of(space.b2());
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = host_caps[i];
-    states[i].set_b2(b2[i], solver.rtol);
+    states[i].b2 = b2[i];
   }
   if (takes_start(solver.method, x0)) {
     const auto start = make_start(a, whole.detach(), x0).x;
@@ -104,7 +104,7 @@ StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rh
   TensorSpace space(system, rhs, states, /*recording=*/true);
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = caps_[i];
-    states[i].set_b2(b2_[i], solver_.rtol);
+    states[i].b2 = b2_[i];
   }
   State after;
   with_method(solver_.method, solver_.restart, space, [&](auto method) {

@@ -61,7 +61,8 @@ SampleOutcome solve_sample(Space& space, Method& method, const GivenSample<T>& o
       return zero_instead(consistent ? SolveStatus::kStagnated : SolveStatus::kInconsistent);
   }
   space.take_b();
-  state.set_b2(space.b2(), of.rtol);
+  state.b2 = space.b2();
+  if (!of.whole_cycles) state.end_cycles_at(of.rtol);
   state.rounding2 = rounding * rounding;
   if (of.x0) start_from(space, of.x0);
   iterate(space, method, states, of.rtol, of.guarded);

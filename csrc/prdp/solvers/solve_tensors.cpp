@@ -19,7 +19,8 @@ namespace prdp {
 namespace {
 
 /// The states before the first iteration: those of samples that are settled are not active. One copy.
-void fill_states(std::vector<SampleState>& states, const PreparedBatch& batch, const at::Tensor& b2, double rtol) {
+void fill_states(std::vector<SampleState>& states, const PreparedBatch& batch, const at::Tensor& b2,
+                 const SolveRequest& request) {
   const auto& applied = batch.start.applied;
   const auto number = [&](const at::Tensor& t) { return t.flatten().to(b2.scalar_type()); };
   const auto host = at::stack({number(batch.status), number(b2),
@@ -30,7 +31,8 @@ void fill_states(std::vector<SampleState>& states, const PreparedBatch& batch, c
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     s.status = static_cast<SolveStatus>(static_cast<int64_t>(status[i]));
-    s.set_b2(norm2[i], rtol);
+    s.b2 = norm2[i];
+    if (!request.whole_cycles) s.end_cycles_at(request.solver.rtol);
     s.rounding2 = rounding[i] * rounding[i];
     s.active = s.status == SolveStatus::kMaxIter;
     s.concluded = !s.active;
@@ -86,7 +88,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, batch.rhs, states);
   // Before start_from(), after which b2() is that of the start's residual.
-  fill_states(states, batch, space.b2(), solver.rtol);
+  fill_states(states, batch, space.b2(), request);
   if (batch.start.x.defined()) space.start_from(batch.start.x, batch.start.r);
 
   const auto run = [&](auto method) {

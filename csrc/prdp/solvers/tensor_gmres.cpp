@@ -125,7 +125,8 @@ at::Tensor TensorGmres::minimise() {
     const double* h = host.const_data_ptr<double>() + sample * (size + 1);
     const double length = std::sqrt(h[size]);
     HessenbergProblem problem(numbers, m_);
-    problem.start(h[size], is_first_ ? space_.enough2_of(sample) : 0.0);
+    problem.start(h[size], space_.enough2_of(sample));
+    if (!is_first_) problem.leave_first();
     problem.scale() = scale_[sample];
     problem.begin(length);
     int64_t columns = 0;

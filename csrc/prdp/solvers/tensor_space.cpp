@@ -179,7 +179,9 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
 }
 
 bool TensorSpace::all_ended(const Scalar& ended) {
-  if (!ended.is_cpu()) return false;  // other devices would have to be waited for; the basis goes on with zeros
+  // Other devices would have to be waited for; later cycles seldom end. The basis goes on with zeros.
+  if (!ended.is_cpu() || std::any_of(states_.begin(), states_.end(), [](const auto& s) { return s.iterations > 0; }))
+    return false;
   const auto rows = values_of(ended);
   ended_.resize(rows.size());
   bool all = true;
