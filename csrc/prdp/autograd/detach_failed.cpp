@@ -18,7 +18,7 @@ at::Tensor detach_failed(const at::Tensor& u, const at::Tensor& status) {
                         (!rollout || u.sym_size(1) == status.sym_size(1) + 1),
                     "detach_failed: u of shape ", u.sym_sizes(), " does not fit a status of shape ",
                     status.sym_sizes());
-  auto failed = status.lt(static_cast<int64_t>(SolveStatus::kStagnated));
+  auto failed = is_failure(status);
   if (!at::isTensorSubclassLike(failed) && !failed.any().item<bool>()) return u;
   if (rollout) failed = at::constant_pad_nd(failed.cumsum(1), {1, 0}).gt(0);
   return at::where(per_sample(failed, u), u.detach(), u);

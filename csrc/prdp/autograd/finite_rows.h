@@ -12,9 +12,13 @@ using Rows = std::vector<bool>;  // which samples
 inline bool any(const Rows& rows) { return std::find(rows.begin(), rows.end(), true) != rows.end(); }
 inline bool all(const Rows& rows) { return std::find(rows.begin(), rows.end(), false) == rows.end(); }
 
-/// The samples that are in both, and those of `rows` that are not in `others`.
+/// The samples that are in both, in either, and those of `rows` that are not in `others`.
 inline Rows both(Rows rows, const Rows& others) {
   for (size_t i = 0; i < rows.size(); ++i) rows[i] = rows[i] && others[i];
+  return rows;
+}
+inline Rows either(Rows rows, const Rows& others) {
+  for (size_t i = 0; i < rows.size(); ++i) rows[i] = rows[i] || others[i];
   return rows;
 }
 inline Rows except(Rows rows, const Rows& others) {

@@ -51,10 +51,7 @@ OperatorSpec with_healthy_tensors(OperatorSpec a, const Rows& take_part) {
   for (size_t k = 0; k < a.tensors.size(); ++k) {
     if (!is_of_samples(a, k, batch)) continue;
     auto healthy = take_part;
-    if (!knows_axes(a)) {  // it may be shared
-      const auto finite = finite_rows(a.tensors[k].reshape({batch, -1}));
-      for (int64_t i = 0; i < batch; ++i) healthy[i] = healthy[i] || finite[i];
-    }
+    if (!knows_axes(a)) healthy = either(healthy, finite_rows(a.tensors[k].reshape({batch, -1})));  // it may be shared
     a.tensors[k] = with_healthy_rows(a.tensors[k], healthy);
   }
   return a;

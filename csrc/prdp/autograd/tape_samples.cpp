@@ -63,7 +63,7 @@ void reverse_sample(const SystemWithTranspose<T>& pair, ThreadMemory<T>& memory,
   values.load(b, scale, values.b());
   values.project(values.b());
   values.take_b();
-  state.b2 = values.b2();
+  const double b2 = values.b2();
   if (batch.x0) start_from(values, batch.x0 + s * n);
   tape.begin();
   TapeSpace<T> space(tape, values);
@@ -73,7 +73,7 @@ void reverse_sample(const SystemWithTranspose<T>& pair, ThreadMemory<T>& memory,
   layout.load(cotangent, bar_scale, x_bar);
   values.project_solution(x_bar);
   const StoredIterates plan{batch.iterations[s], batch.checkpoint_every};
-  T* result = run_and_take_back(memory, space, back, x_bar, batch.solver, plan, state.b2);
+  T* result = run_and_take_back(memory, space, back, x_bar, batch.solver, plan, b2);
   values.project(result);
   if (const T* start = values.started_from()) back.differentiate(-1, result, start);  // r₀ = b - A start
   layout.store(result, T(1) / lambda_scale, batch.b_bar + s * n);

@@ -188,8 +188,8 @@ class SampleVjps {
     auto misleading = misleading_b_bar(*a_, finite_cotangent_, found_.gradients[0], rows, allowed);
     rows = except(rows, misleading);
     if (needs_gradient_of_a_ && any(rows)) {
-      const auto more = can_be_alone() ? misleading_alone(rows, allowed) : misleading_together(rows, allowed);
-      for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || more[i];
+      misleading =
+          either(misleading, can_be_alone() ? misleading_alone(rows, allowed) : misleading_together(rows, allowed));
     }
     if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)

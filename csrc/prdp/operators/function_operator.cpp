@@ -77,8 +77,8 @@ int64_t writes(const at::Tensor& t) { return t.is_inference() ? 0 : static_cast<
 /// The arguments of a product, which it must leave as they are.
 class UnchangedArguments {
  public:
-  UnchangedArguments(const at::Tensor& v, const std::vector<at::Tensor>& tensors, bool in_inference_mode)
-      : v_(v), tensors_(tensors), before_(all_writes()), copy_(in_inference_mode ? v.clone() : at::Tensor()) {}
+  UnchangedArguments(const at::Tensor& v, const std::vector<at::Tensor>& tensors, bool compares_numbers)
+      : v_(v), tensors_(tensors), before_(all_writes()), copy_(compares_numbers ? v.clone() : at::Tensor()) {}
   void check_unchanged(const char* name) const {
     const bool is_unchanged =
         all_writes() == before_ && (!copy_.defined() || at::allclose(v_, copy_, 0.0, 0.0, /*equal_nan=*/true));
@@ -269,7 +269,7 @@ at::Tensor FunctionOperator::norm_of(bool transposed) const {
   return norm;
 }
 
-/// Those of which the product with ones is not finite, if one of the tensors is not; all, if none of them is.
+/// Where a tensor is not finite: the samples whose product with ones is not, or all samples if no product is.
 at::Tensor FunctionOperator::nonfinite_samples(const at::Tensor& b) const {
   auto some = at::zeros({}, b.options().dtype(at::kBool));
   bool any_numbers = false;

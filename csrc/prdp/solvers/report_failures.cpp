@@ -38,7 +38,6 @@ struct Report {
         iterations(to_host<int64_t>(info.iterations, b.size(0))),
         residuals(to_host<double>(info.residual, b.size(0))) {}
 
-  std::vector<double> floors() const { return to_host<double>(info.floor, batch()); }
   int64_t batch() const { return b.size(0); }
   double rtol() const { return role.solver.rtol; }
   SolveStatus status(int64_t i) const { return static_cast<SolveStatus>(statuses[i]); }
@@ -98,12 +97,13 @@ std::string whereabouts(const Report& report, int64_t sample) {
 /// rounding leaves of a u that is good enough, but nobody else would say that it may not be. Returns whether there are
 /// any.
 bool warn_of_stagnation(const Report& report) {
-  const auto floors = report.floors();
-  const auto stagnated = report.samples_where([&](int64_t i) {
-    // Where residual and floor are equal, u consists of the least numbers of its dtype, and that is their rounding.
-    return report.status(i) == SolveStatus::kStagnated && report.residuals[i] > report.large_residual() &&
-           report.residuals[i] != floors[i];
+  auto stagnated = report.samples_where([&](int64_t i) {
+    return report.status(i) == SolveStatus::kStagnated && report.residuals[i] > report.large_residual();
   });
+  if (stagnated.empty()) return false;
+  // Where residual and floor are equal, u consists of the least numbers of its dtype, and that is their rounding.
+  const auto floors = to_host<double>(report.info.floor, report.batch());
+  std::erase_if(stagnated, [&](int64_t i) { return report.residuals[i] == floors[i]; });
   if (stagnated.empty()) return false;
   const int64_t worst = report.worst_of(stagnated);
   report.warn("", stagnated.size(), worst, SolveStatus::kStagnated, [&](std::ostream& text) {
@@ -219,21 +219,16 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
     return look_for_lost_cotangents(role, info);
   const auto on_host = info.status.to(at::kCPU);
   const auto* first = on_host.const_data_ptr<int64_t>();
-  const auto any_is = [&](auto... wanted) {
-    return std::any_of(first, first + b.size(0),
-                       [&](int64_t s) { return (wanted(static_cast<SolveStatus>(s)) || ...); });
+  const auto is_told = [&](int64_t s) {  // MAX_ITER without a tolerance is what was asked for
+    const auto status = static_cast<SolveStatus>(s);
+    return !is_solved(status) && (status != SolveStatus::kMaxIter || role.solver.rtol > 0.0);
   };
-  const auto is_stagnated = [](SolveStatus s) { return s == SolveStatus::kStagnated; };
-  const bool asks_for_tolerance = role.solver.rtol > 0.0;  // else MAX_ITER is what was asked for
-  if (asks_for_tolerance ? !any_is([](SolveStatus s) { return !is_solved(s); })
-                         : !any_is([](SolveStatus s) { return is_failure(s); }, is_stagnated))
-    return;
+  if (std::none_of(first, first + b.size(0), is_told)) return;
   const Report report(role, a, b, info);
   const auto failed = report.samples_where([&](int64_t i) { return is_failure(report.status(i)); });
   if (failed.empty()) {
     const auto unsolved = report.samples_where([&](int64_t i) { return !is_solved(report.status(i)); });
-    const bool have_stopped = warn_of_stopped(report);
-    const bool have_stagnated = any_is(is_stagnated) && warn_of_stagnation(report);
+    const bool have_stopped = warn_of_stopped(report), have_stagnated = warn_of_stagnation(report);
     if (!have_stopped && !have_stagnated) warn_of_unfit(report, unsolved);
     return;
   }
