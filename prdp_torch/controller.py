@@ -249,10 +249,10 @@ class ToleranceController(_C.ToleranceController, _Attached):
             after every step. It may be empty; then read `.rtol`, `.adjoint_rtol` and `.max_iter` yourself.
         ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1), 0.1 by default; rtol is 1e-3 before the
             first `step`.
-        adjoint_ratio: the rtol of the adjoint solve is rtol / adjoint_ratio, at most 1/2, and its K is
-            ⌈adjoint_ratio·K⌉; in (0, 1], 0.1 by default. Take 1 with a Krylov method without multigrid.
-        floor: the smallest rtol; > 0, 1e-5 by default, which solves in float32 reach.
-        adjoint_floor: the smallest rtol of the adjoint solve; > 0, 0.01 by default. That rtol is relative to a
+        adjoint_ratio: the rtol of the adjoint solve is min(1/10, rtol / adjoint_ratio), and its K is ⌈adjoint_ratio·K⌉;
+            in (0, 1], 0.1 by default.
+        floor: the smallest rtol; in (0, 1), 1e-5 by default, which solves in float32 reach.
+        adjoint_floor: the smallest rtol of the adjoint solve; in (0, 1), 0.01 by default. That rtol is relative to a
             cotangent that shrinks with the error, and a descent needs no better gradient late than early.
         maximum: K >= 1, 10,000 by default. It is only a limit, which the solves should not reach.
         process_group: as for `PRDPController`. The error is averaged over the processes.

@@ -118,9 +118,11 @@ TEST(ToleranceController, TiesTheToleranceToTheSmallestErrorSoFar) {
   EXPECT_DOUBLE_EQ(controller.rtol(), 0.1);
   EXPECT_TRUE(controller.step(0.4));
   EXPECT_DOUBLE_EQ(controller.rtol(), 0.04);
-  EXPECT_DOUBLE_EQ(controller.adjoint_rtol(), 0.2);
+  EXPECT_DOUBLE_EQ(controller.adjoint_rtol(), 0.1);  // its bound
+  EXPECT_TRUE(controller.step(0.1));
+  EXPECT_DOUBLE_EQ(controller.adjoint_rtol(), 0.05);
   EXPECT_FALSE(controller.step(0.9));
-  EXPECT_DOUBLE_EQ(controller.rtol(), 0.04);
+  EXPECT_DOUBLE_EQ(controller.rtol(), 0.01);
   EXPECT_TRUE(controller.step(0.0));
   EXPECT_DOUBLE_EQ(controller.rtol(), 1e-3);
   EXPECT_DOUBLE_EQ(controller.adjoint_rtol(), 1e-2);  // its floor
@@ -128,12 +130,15 @@ TEST(ToleranceController, TiesTheToleranceToTheSmallestErrorSoFar) {
   EXPECT_EQ(controller.budget().adjoint_max_iter, 2000);
 }
 
-TEST(ToleranceController, NeverAsksForAnAdjointSolveThatIsNone) {
-  for (const auto& [ratio, expected] : {std::pair{0.1, 0.5}, {0.8, 0.8}}) {
-    prdp::ToleranceController controller({.ratio = ratio, .adjoint_ratio = 0.1});
+TEST(ToleranceController, LetsAnAdjointSolveBeLooserThanATenthOnlyWhereItIsTold) {
+  const auto after_no_success = [](prdp::ToleranceSettings settings) {
+    prdp::ToleranceController controller(settings);
     controller.step(1.0);
-    EXPECT_DOUBLE_EQ(controller.adjoint_rtol(), expected);
-  }
+    return controller.adjoint_rtol();
+  };
+  EXPECT_DOUBLE_EQ(after_no_success({}), 0.1);
+  EXPECT_DOUBLE_EQ(after_no_success({.ratio = 0.8}), 0.8);
+  EXPECT_DOUBLE_EQ(after_no_success({.adjoint_floor = 0.5}), 0.5);
 }
 
 TEST(ToleranceController, ABadErrorRaisesAndChangesNothing) {

@@ -97,22 +97,6 @@ def test_without_an_error_prdp_warns_of_a_stalled_metric():
     assert "the metric no longer falls" in controller.warning
 
 
-def test_an_error_that_never_falls_names_loose_adjoint_solves():
-    controller = prdp.ToleranceController()
-    for _ in range(19):
-        controller.step(0.95)
-        assert controller.warning is None
-    controller.step(0.94)
-    assert "has not fallen in 20 calls, and adjoint solves to 0.5" in controller.warning
-    assert controller.warning.endswith("take adjoint_ratio=1")
-    controller.step(0.5)
-    assert controller.warning is None
-    exact = prdp.ToleranceController(adjoint_ratio=1)
-    for _ in range(25):
-        exact.step(0.95)
-    assert exact.warning is None
-
-
 class Foreign:
     """A solver of somebody else's, whose attributes have names of ours."""
 

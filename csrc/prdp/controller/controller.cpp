@@ -27,11 +27,10 @@ bool is_size(double x) { return std::isfinite(x) && x >= 0.0; }
 }  // namespace
 
 std::optional<std::string> Controller::warning() const {
-  std::string text;
-  for (const auto& sentence : {about_metric(), about_residual(), about_adjoint()}) {
-    if (!text.empty() && !sentence.empty()) text += ". ";
-    text += sentence;
-  }
+  auto text = about_metric();
+  const auto residual = about_residual();
+  if (!text.empty() && !residual.empty()) text += ". ";
+  text += residual;
   return text.empty() ? std::nullopt : std::optional(text);
 }
 

@@ -66,7 +66,7 @@ class Controller {
   /// Restores a state. Raises ValueError, and changes nothing, for a state that these settings cannot have reached.
   virtual void load_state(State state) = 0;
 
-  /// What is wrong, or nothing: a sentence about the metric, one about the solves, or several.
+  /// What is wrong, or nothing: a sentence about the metric, one about the solves, or both.
   ///   - The last step() raised an error for its metric; or else the metric grows: it was more than twice its least
   ///     value, three times in a row.
   ///   - The solves stop so far from the solution that their error dominates what is trained. The reason: say the
@@ -74,7 +74,6 @@ class Controller {
   ///     residual of that solve. So a residual as large as the error is the error. If the error is not known, a large
   ///     residual counts once the metric has stalled.
   ///   - Most of the last solves took no iteration, so that steps pass their start on.
-  ///   - The error has not fallen, and the adjoint solves are so loose that their gradient may point uphill.
   std::optional<std::string> warning() const;
 
  protected:
@@ -93,8 +92,6 @@ class Controller {
   virtual const char* remedy() const = 0;
   /// Whether the metric no longer falls.
   virtual bool stalled() const = 0;
-  /// A sentence on the adjoint solves, or nothing.
-  virtual std::string about_adjoint() const { return {}; }
   /// The residual that the solves before the last step() were asked for, which is no cause for a warning.
   virtual double asked_for() const { return 0.0; }
 

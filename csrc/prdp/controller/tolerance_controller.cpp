@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <sstream>
 
 namespace prdp {
 
@@ -26,9 +25,10 @@ double ToleranceController::rtol_for(double smallest) const {
 }
 
 double ToleranceController::adjoint_rtol() const {
-  constexpr double loosest = 0.5;
-  const double wanted = std::max(settings_.adjoint_floor, rtol() / settings_.adjoint_ratio);
-  return std::max(rtol(), std::min(loosest, wanted));
+  // At 1/2 a Krylov method leaves out of the gradient what matters: its cosine with the exact one, of a field seen by two
+  // sensors, fell to 0.33, at 1/5 to 0.75, at 1/10 to 0.94, and emulators ended up to 18 times as far off.
+  constexpr double loosest = 0.1;
+  return std::max({rtol(), settings_.adjoint_floor, std::min(loosest, rtol() / settings_.adjoint_ratio)});
 }
 
 Budget ToleranceController::budget() const {
@@ -48,20 +48,6 @@ bool ToleranceController::step(double error, const Solves& solves) {
 double ToleranceController::asked_for() const {
   const auto& history = state_.history;
   return rtol_for(history.size() > 1 ? history[history.size() - 2].smoothed : std::numeric_limits<double>::infinity());
-}
-
-std::string ToleranceController::about_adjoint() const {
-  // As after sparse sensors, or of an indefinite A: with adjoint solves to 0.5, gradients were seen at more than a
-  // right angle to the exact one, and no error fell to tighten them.
-  constexpr size_t patience = 20;
-  constexpr double loose = 0.1, fallen = 0.9;
-  const auto& history = state_.history;
-  if (history.size() < patience || adjoint_rtol() <= loose || state_.checkpoint < fallen * history.front().metric)
-    return {};
-  std::ostringstream text;
-  text << name() << ": the error has not fallen in " << history.size() << " calls, and adjoint solves to "
-       << adjoint_rtol() << " may have a gradient that points uphill; take adjoint_ratio=1";
-  return text.str();
 }
 
 void ToleranceController::load_state(State state) {

@@ -14,9 +14,9 @@ struct ToleranceSettings {
 /// Ties the tolerance of the solves to the error of what is trained:
 ///   rtol         = max(floor, ratio · min(1, e)), e being the smallest relative error so far; before the first,
 ///                  max(floor, 1e-3)
-///   adjoint_rtol = rtol / adjoint_ratio, at least adjoint_floor and at most 1/2, but never below rtol
-/// A tolerance of 1 would be no solve, hence 1/2. The floor is there because the cotangent shrinks with the error, and
-/// gradients need not become more accurate late. K, and ⌈adjoint_ratio·K⌉ for the adjoint solve, are only limits.
+///   adjoint_rtol = min(1/10, rtol / adjoint_ratio), but at least adjoint_floor and rtol
+/// Looser adjoint solves give directions in which a descent gets nowhere, hence 1/10. The floor is there because the
+/// cotangent shrinks with the error, and gradients need not become more accurate late. K, and ⌈adjoint_ratio·K⌉ for the adjoint solve, are only limits.
 /// Source: the forcing term of inexact Newton methods (Eisenstat and Walker 1996) and of optimisation with
 /// approximate gradients (Pedregosa 2016), applied to training.
 class ToleranceController final : public Controller {
@@ -45,7 +45,6 @@ class ToleranceController final : public Controller {
   }
   bool stalled() const override { return true; }  // not used: its metric is the error
   double asked_for() const override;
-  std::string about_adjoint() const override;
 
   ToleranceSettings settings_;
 };
