@@ -93,15 +93,15 @@ class _Attached(_Compiled):
             self._has_spoken = True
             _C.warn(f"{warning} (said once; `.warning` has the state of the last interval)")
 
-    def _recorded(self, record: Callable[[list[Row], int], R]) -> list[R]:
-        """The history, of `record(rows, number)` each. Those made before are kept, as loops read the last one."""
-        rows = self._history
-        self._records += [record(rows, number) for number in range(len(self._records), len(rows))]
+    def _recorded(self, record: Callable[[Row, R | None], R]) -> list[R]:
+        """The history, of `record(row, the one before)` each. Those made before are kept, as loops read the last."""
+        for row in self._history_from(len(self._records)):
+            self._records.append(record(row, self._records[-1] if self._records else None))
         return list(self._records)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state as plain values, for `load_state_dict`."""
-        state = {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
+        state = {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history_from(0)}
         return {"controller": _kind(type(self)), **state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -230,11 +230,11 @@ class PRDPController(_C.PRDPController, _Attached):
     @property
     def history(self) -> list[Record]:
         """Every call of `step` as a `Record`."""
-        return self._recorded(lambda rows, number: Record(*rows[number]))
+        return self._recorded(lambda row, _: Record(*row))
 
     def __repr__(self) -> str:
         settings = ", ".join(f"{name}={value:g}" for name, value in self.settings.items() if value is not None)
-        smoothed = f"{self.history[-1].smoothed:.3e}" if self._history else "none yet"
+        smoothed = f"{self.history[-1].smoothed:.3e}" if self.history else "none yet"
         return f"PRDPController(max_iter={self.max_iter}, smoothed metric {smoothed}; {settings})"
 
 
@@ -299,9 +299,9 @@ class ToleranceController(_C.ToleranceController, _Attached):
         """Every call of `step` as a `ToleranceRecord`."""
         return self._recorded(self._record)
 
-    def _record(self, rows: list[Row], number: int) -> ToleranceRecord:
-        error, smallest, _, tightened, _, residual = rows[number]
-        earlier = rows[number - 1][1] if number else math.inf
+    def _record(self, row: Row, before: ToleranceRecord | None) -> ToleranceRecord:
+        error, smallest, _, tightened, _, residual = row
+        earlier = math.inf if before is None else before.smallest
         return ToleranceRecord(error, smallest, self._rtol_for(earlier), tightened, residual)
 
     def __repr__(self) -> str:

@@ -7,11 +7,13 @@ class Record(NamedTuple):
     """One call of `step` of a `PRDPController`."""
 
     metric: float
+    """What `step` was given."""
     smoothed: float
     """Exponentially weighted mean L̃ of the metrics so far."""
     max_iter: int
     """K before the decision."""
     refined: bool
+    """Whether K was raised."""
     error: float | None = None
     """The relative error that `step` was given."""
     residual: float | None = None
@@ -46,10 +48,12 @@ class ToleranceRecord(NamedTuple):
     """One call of `step` of a `ToleranceController`."""
 
     error: float
+    """What `step` was given."""
     smallest: float
     """The smallest error so far."""
     rtol: float
     """Before the decision."""
     tightened: bool
+    """Whether rtol became smaller."""
     residual: float | None = None
     """As of a `Record`."""

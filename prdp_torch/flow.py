@@ -35,7 +35,8 @@ class Flow(HoldsTensors, Stepper):
         nu: viscosity >= 0, length²/time. A 0-dimensional tensor gets a gradient. A Parameter becomes one of the module,
             and another tensor a buffer. The same holds for `force`, `inflow` and `wall_velocity`.
         dt: time step > 0. The advection needs dt Σ |u|/dx <= 1, or with central advection and implicit diffusion at
-            most √(nu dt Σ 2/(d dx²)) where that is larger; a longer step raises an error.
+            most √(2 nu dt)/dx for the largest dx where that is larger, and with upwind advection and explicit
+            diffusion at most 1 - nu dt Σ 2/dx²; a longer step raises an error.
         boundary: one for all axes, or one per axis in the order of `shape`.
             "periodic".
             "wall": no slip at both ends. The low face of the first cell lies on the wall.
@@ -51,14 +52,15 @@ class Flow(HoldsTensors, Stepper):
             first order and stable without viscosity.
         diffusion: "implicit" solves with `solver`, and "explicit" needs nu dt Σ 2/dx² <= 1.
         pressure: "incremental" takes the pressure of all forces off before the implicit diffusion, by one more solve.
-            Steady flows then do not depend on dt, up to nu dt/dx² = 4. "plain" leaves the pressure to the projection
-            after it. The two are the same with explicit diffusion, and in a periodic box without obstacle.
+            Steady flows then do not depend on dt, up to nu dt/dx² = 4, or 1.25 with an obstacle and a periodic axis.
+            "plain" leaves the pressure to the projection after it. The two are the same with explicit diffusion, and
+            in a periodic box without obstacle.
         solver: for the pressure and the implicit diffusion, both symmetric. CG(100) with multigrid by default.
         backward and the other options: as in `Stepper`, but `start` must be "zero".
 
-    `nu`, `force`, `inflow` and `wall_velocity` may be set at any time. A tensor that is set later is for the steps that
-    follow, as the output of a network is: it is no state, so that copies and `state_dict` have what was there before.
-    A Parameter, a `torch.nn.Buffer` and numbers are state.
+    `nu`, `force`, `inflow`, `wall_velocity`, `obstacle`, `dt` and `advection` may be set at any time. A tensor that is
+    set later is for the steps that follow, as the output of a network is: it is no state, so that copies and
+    `state_dict` have what was there before. A Parameter, a `torch.nn.Buffer` and numbers are state.
 
     `info` combines the solves of a step: it has the sum of their iterations, the worst status and the largest residual.
     Each step stores one state for the backward pass, and computes the rest again.
@@ -178,7 +180,8 @@ class Flow(HoldsTensors, Stepper):
     @not_in_graphs
     @forgets_if_it_raises
     def step_and_pressure(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the next state and the `pressure` of the step, by one step. Its gradient takes one adjoint step."""
+        """Return the next state, (batch, d, *shape), and the `pressure` of the step, (batch, 1, *shape), by one step.
+        Its gradient takes one adjoint step. Raises as `forward`."""
         u = _field("Flow", "u", u)
         log = self._adjoint_log.number
         found: Solution = self._equation().step_and_pressure(u, self._options_kept(), self._max_iter, log)
@@ -205,20 +208,20 @@ class Flow(HoldsTensors, Stepper):
 
     @not_in_graphs
     def project(self, u: Tensor) -> Tensor:
-        """Return the velocity nearest to u, (batch, d, *shape), with the boundary values and without divergence. NaN
-        in u remains, and `info` stays that of the last step."""
+        """Return the velocity nearest to u, (batch, d, *shape), with the boundary values and without divergence.
+        `info` stays that of the last step. Raises as `forward`; where on_failure lets NaN in u pass, it remains."""
         return self._equation().project(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
     @not_in_graphs
     def pressure(self, u: Tensor) -> Tensor:
         """Return the pressure of the step from u, (batch, 1, *shape). It is zero inside obstacles, and its mean is zero
-        unless an axis is open. `info` stays that of the last step."""
+        unless an axis is open. `info` stays that of the last step. Raises as `forward`."""
         return self._equation().pressure(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
     @not_in_graphs
     def divergence(self, u: Tensor) -> Tensor:
         """Return ∇·u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last
-        cells before an open end, whose high faces take what mass conservation gives."""
+        cells before an open end, whose high faces take what mass conservation gives. NaN in u remains."""
         return self._equation().divergence(_field("Flow", "u", u))
 
     def _equation(self) -> _C.FlowEquation:

@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from prdp_torch import _C, _check
-from prdp_torch.operators import Operator
+from prdp_torch.operators import Function, Operator, Stencil
 from prdp_torch.operators.base import full_precision, without_autocast
 from prdp_torch.operators.matrix import Matrix, as_operator
 from prdp_torch.solve import linear_solve
@@ -137,7 +137,9 @@ def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
             vector = f"torch.ones{(1, *shape)}"
             yield f"A maps the constant of all channels to zero, so it is singular: give nullspace={vector}"
             return
-    yield "A maps the constant to zero, so it is singular: give nullspace='constant'"
+    can_name_it = isinstance(A, Stencil | Matrix | Function)
+    remedy = "give nullspace='constant'" if can_name_it else "enlarge the shift, or take a shorter time step"
+    yield f"A maps the constant to zero, so it is singular: {remedy}"
 
 
 def _captures(A: Operator, v: Tensor) -> Iterator[str]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from prdp_torch import _C, _check, operators
+from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.operators.matrix import hint_for
 from prdp_torch.solvers import Solver, check_options, packed_options
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Solution
@@ -39,6 +39,12 @@ class AdjointLog:
         self._kept = _C.AdjointLog()  # closes the log with it
         self.number: int = self._kept.number
 
+    def number_in_graph(self) -> int:
+        """`number` as torch.compile takes it, which otherwise compiles again for each log."""
+        compiling = torch.compiler.is_dynamo_compiling()
+        number: int = torch_private.number_as_graph_input(self, "number") if compiling else self.number
+        return number
+
     def read(self) -> "SolveInfo | None":
         return _as_info(_C.read_adjoint_log(self.number))
 
@@ -53,7 +59,7 @@ class LogOfStep(AdjointLog):
     """That of a step of a rollout within the one log of all, which is the only one that a compiled graph can hold."""
 
     def __init__(self, log: AdjointLog, step: int) -> None:
-        self.number = log.number + 1 + step
+        self.number = log.number_in_graph() + 1 + step
 
 
 class LogOfRollout(AdjointLog):
@@ -130,7 +136,8 @@ class SolveInfo(NamedTuple):
 
     @property
     def solved(self) -> Tensor:
-        """Which samples are solved (bool): they met the tolerance, or came as near as their dtype allows."""
+        """Which samples are solved (bool): they met the tolerance, or came as near as their dtype allows. With rtol = 0
+        none does."""
         return (self.status > 0) | (self.floor > 0)
 
     @property
@@ -202,9 +209,9 @@ def linear_solve(
             torch.linalg.LinAlgError that names the samples, "warn", "return", or "zero_grad". The last returns as
             "return" does, and b and A get no gradient from the samples whose forward or adjoint solve failed.
             Reaching max_iter is not a failure.
-        checkpoint_every: for "unrolled" only. The backward pass needs all K iterates. With a number n it
-            stores every n-th one and recomputes the others; "sqrt" stands for n = ⌈√K⌉, and None stores all.
-            The gradient is the same bit for bit.
+        checkpoint_every: for "unrolled" only. The backward pass runs the iterations again, on the CPU one sample at
+            a time, and holds their K iterates. With a number n it holds every n-th one and recomputes those between;
+            "sqrt" stands for n = ⌈√K⌉, and None holds all. The gradient is the same bit for bit.
         x0: a guess of u, with the shape, dtype and device of b. Each sample starts from α x0, where
             α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ minimises the residual. So the start is never worse than zero, and the
             length of x0 does not matter. It costs one product. rtol stays relative to ‖b‖. x0 gets no

@@ -135,7 +135,7 @@ def check_solver(who: str, *solver: Any, **others: Any) -> _C.SolveOptions:
 @dataclass
 class Jacobi(Solver):
     """Jacobi's method, u ← D⁻¹(b - (L + U) u), where A = D + L + U and D is the diagonal. It converges if the
-    spectral radius of D⁻¹(L + U) is below 1."""
+    spectral radius of D⁻¹(L + U) is below 1. It takes no preconditioner."""
 
     method: ClassVar[str] = "jacobi"
 
@@ -144,7 +144,7 @@ class Jacobi(Solver):
 class Chebyshev(Solver):
     """Chebyshev's semi-iteration over Jacobi's method. It takes fewer iterations than `Jacobi`, about √n in place of n,
     and an iteration costs the same. Its weights need the spectrum of A, which is known for `Heat` and `Poisson`
-    only.
+    only; a solve raises ValueError for other operators. It takes no preconditioner.
 
     Source: Golub and Varga 1961.
     """
@@ -154,7 +154,7 @@ class Chebyshev(Solver):
 
 @dataclass
 class SteepestDescent(Solver):
-    """Steepest descent for definite operators: α = r·r / r·Ar; u += α r; r -= α A r."""
+    """Steepest descent for definite operators: α = r·r / r·Ar; u += α r; r -= α A r. It takes no preconditioner."""
 
     method: ClassVar[str] = "steepest_descent"
 
@@ -163,10 +163,10 @@ class SteepestDescent(Solver):
 class CG(Solver):
     """Conjugate gradients, for symmetric definite operators.
 
-    `preconditioner="diagonal"` divides by the diagonal. Where the diagonal varies much, as with a diffusivity that
-    varies in space, this saves most of the iterations. If the diagonal is constant, it saves none. A zero on the
-    diagonal is refused (ZERO_DIAGONAL). A preconditioner of your own must be symmetric and definite. Where it is not
-    definite, a sample ends with BREAKDOWN; where it is not symmetric, rtol is not reached, and a warning says so.
+    `preconditioner="diagonal"` divides by the diagonal. It saves the more the more the diagonal varies, as with a
+    diffusivity that jumps, and nothing where it is constant. A zero on the diagonal is refused (ZERO_DIAGONAL). A
+    preconditioner of your own must be symmetric and definite. Where it is not definite, a sample ends with BREAKDOWN;
+    where it is not symmetric, rtol is not reached, and a warning says so.
 
     Source: Hestenes and Stiefel 1952.
     """
@@ -204,8 +204,8 @@ class GMRES(Solver):
     """Restarted GMRES(m), for any operator. A cycle has m = `restart` products, 10 by default, and `max_iter` counts
     cycles.
 
-    The residual never grows. In float32 unrolled gradients can be far off, so prefer implicit ones. A preconditioner
-    is applied from the right, so the residual stays that of A u = b.
+    `restart` is at least 1. The residual never grows. In float32 unrolled gradients can be far off, so prefer implicit
+    ones. A preconditioner is applied from the right, so the residual stays that of A u = b.
 
     Source: Saad and Schultz 1986.
     """
@@ -227,8 +227,8 @@ class Multigrid(Solver):
     An iteration is one V-cycle. It is for `Heat`, `Poisson`, `Burgers`, `Diffusion`, and for `Stencil` with neighbours
     at most one cell away, in one to three dimensions, of any size and with any coefficients. As a preconditioner of
     `CG` and `MINRES`, or of `GMRES` and `BiCGStab` if A is not symmetric, it takes fewer cycles and is more robust;
-    `NavierStokes` takes it so, too. There, `max_iter` and `rtol` have no influence. Unrolled gradients of A take the
-    cycles for constants.
+    so does `NavierStokes`, with `GMRES` or `BiCGStab`. There, `max_iter` and `rtol` have no influence. Unrolled
+    gradients of A take the cycles for constants.
 
     Args:
         max_iter, rtol: as those of every `Solver`; a cycle counts as an iteration.

@@ -107,10 +107,9 @@ class HasSettings(torch_private.HearsOfMoves):
 
     def _packed_options(self, log: AdjointLog) -> PackedOptions:
         """The options as the ops of torch take them."""
-        number = log.number
         if not torch.compiler.is_dynamo_compiling():
             k, m, settings = self._max_iter, self.preconditioner, self._settings()
-            return packed_options(self.method, k, self._rtol, self.restart, m, *settings, adjoint_log=number)
+            return packed_options(self.method, k, self._rtol, self.restart, m, *settings, adjoint_log=log.number)
         k = torch_private.number_as_graph_input(self, "_max_iter")
         rtol = torch_private.number_as_graph_input(self, "_rtol_bits")
         of_adjoint = torch_private.number_as_graph_input(self, "_adjoint_rtol_bits")
@@ -126,7 +125,7 @@ class HasSettings(torch_private.HearsOfMoves):
             on_failure=self.on_failure,
             checkpoint_every=self.checkpoint_every,
             start=self.start,
-            adjoint_log=number,
+            adjoint_log=log.number_in_graph(),
             rtol_bits=rtol,
             adjoint_rtol_bits=of_adjoint,
         )

@@ -44,14 +44,14 @@ def unwrapped(t: Tensor) -> Tensor:
     return t
 
 
-def number_as_graph_input(module: torch.nn.Module, name: str) -> Any:
-    """A whole number that a module holds, or None, inside torch.compile, which otherwise takes it for a constant and
-    compiles again for each value. torch.compiler has no such switch for one number: its dynamic_sources is a list for
-    the whole process, which therefore has the number only while it is read."""
+def number_as_graph_input(holder: object, name: str) -> Any:
+    """A whole number, or None, that a module or a part of it holds, inside torch.compile, which otherwise takes it for
+    a constant and compiles again for each value. torch.compiler has no such switch for one number: its dynamic_sources
+    is a list for the whole process, which therefore has the number only while it is read."""
     if torch.compiler.is_exporting():
-        return getattr(module, name)
+        return getattr(holder, name)
     listed = _list_as_dynamic(name)
-    number = getattr(module, name)
+    number = getattr(holder, name)
     if number is not None:
         number = number + 0  # the number is read where it is used first, which must be here
     _list_as_before(listed)

@@ -14,10 +14,14 @@ using Known = std::optional<double>;
 /// A record of any controller: metric, smoothed, max_iter, refined, error, residual.
 using Row = std::tuple<double, double, int64_t, bool, Known, Known>;
 
-std::vector<Row> rows_of(const Controller& controller) {
+/// The rows from number `first` on: a loop that reads the last one in every call would else copy all of them.
+std::vector<Row> rows_from(const Controller& controller, size_t first) {
+  const auto& history = controller.state().history;
   std::vector<Row> rows;
-  for (const auto& r : controller.state().history)
+  for (size_t i = first; i < history.size(); ++i) {
+    const auto& r = history[i];
     rows.emplace_back(r.metric, r.smoothed, r.max_iter, r.refined, r.error, r.residual);
+  }
   return rows;
 }
 
@@ -49,7 +53,7 @@ void bind_interface(py::module_& m) {
                                                "rtol"_a = b.rtol, "adjoint_rtol"_a = b.adjoint_rtol);
                              })
       .def_property_readonly("_checkpoint", [](const Controller& c) { return c.state().checkpoint; })
-      .def_property_readonly("_history", &rows_of);
+      .def("_history_from", &rows_from, "first"_a);
 }
 
 py::dict as_dict(const ToleranceSettings& s) {

@@ -6,8 +6,8 @@
 #include "prdp/operators/function_checks.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/registered_products.h"
+#include "prdp/solvers/memory_check.h"
 #include "prdp/steppers/equation.h"
-#include "prdp/steppers/memory_check.h"
 #include "solves.h"
 
 /// The ops step and linear_solve past torch's dispatcher, which costs more than a small solve. None where somebody

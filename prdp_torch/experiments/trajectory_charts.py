@@ -98,7 +98,7 @@ def snapshots(scene: _C.Scene, shown: Trajectories) -> Figure:
     """The fields in rows, at a few times in columns; a colour scale for each time."""
     contents = _fields(scene, shown)
     metric, last = scene.data.valid_steps, shown.reference.shape[1] - 1
-    times = sorted({scene.data.trained_steps, metric, 2 * metric, last})
+    times = sorted({min(t, last) for t in (scene.data.trained_steps, metric, 2 * metric, last)})
     figure, panels = _grid(len(contents), len(times), height=1.2 + 2.1 * len(contents))
     for column, t in zip(panels.T, times, strict=True):
         images = _draw_fields(column, contents, t)

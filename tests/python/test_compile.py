@@ -179,3 +179,20 @@ def test_no_process_has_the_number_of_another_ones_function():
     program = "from prdp_torch import operators; print(operators.Function(lambda v: v).shape[0])"
     numbers = {subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout for _ in "ab"}
     assert len(numbers) == 2
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("name", ["heat", "burgers"])
+def test_steppers_that_are_alike_share_a_graph(no_log, name, use):
+    """More than eight, where torch.compile gives up."""
+    steps = [STEPPERS[name]() for _ in range(10)]
+    COUNTER.clear()
+    compiled = torch.compile(lambda step, u: USES[use](step, u), backend=COUNTER)
+    for step in steps:
+        eager = STEPPERS[name]()
+        u, v = (field((16,)).requires_grad_() for _ in range(2))
+        compiled(step, u).square().sum().backward()
+        USES[use](eager, v).square().sum().backward()
+        torch.testing.assert_close(u.grad, v.grad, rtol=1e-12, atol=0)
+        assert torch.equal(step.adjoint_info.iterations, eager.adjoint_info.iterations)
+    assert COUNTER.frame_count == 1

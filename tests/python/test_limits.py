@@ -155,3 +155,11 @@ def test_a_log_of_an_adjoint_solve_is_closed_by_no_code_that_could_be_interrupte
     u = torch.ones(2, 3, requires_grad=True)
     step(u).sum().backward()
     assert prdp.solve.AdjointLog().number > number and step.adjoint_info is not None
+
+
+def test_a_restart_that_does_not_fit_is_refused_by_a_lone_solve_too():
+    kappa = torch.ones(1, 1, 1).expand(1, 3000, 3000)
+    b = torch.ones(1, 1, 1, 1).expand(1, 1, 3000, 3000)
+    solver = prdp.GMRES(max_iter=1, restart=10**7)
+    with pytest.raises(ValueError, match=r"GMRES: restart = 10000000 on 9000000 unknowns " + TERABYTES):
+        prdp.linear_solve(prdp.operators.Diffusion(kappa), b, solver)

@@ -292,3 +292,24 @@ def test_walls_that_do_not_fit_the_state_or_are_not_finite_are_named():
     u = (0.1 * random_velocity((8, 6), dtype=torch.float32)).repeat(3, 1, 1, 1).requires_grad_()
     flow(u).square().sum().backward()
     assert (u.grad[1] == 0).all() and u.grad.isfinite().all() and (u.grad[0] != 0).any()
+
+
+@pytest.mark.parametrize("shape, axis", [((5, 4), 0), ((4, 5), 1), ((4, 3, 3), 1)])
+@pytest.mark.parametrize("of_field", [False, True])
+def test_the_component_through_a_wall_gets_no_gradient(shape, axis, of_field):
+    """It must be 0, so an optimiser must not move it."""
+    d = len(shape)
+    across = d - 1 - axis
+    sizes = (1, d, *(n for a, n in enumerate(shape) if a != axis)) if of_field else (d,)
+    velocity = torch.rand(sizes, dtype=torch.float64)
+    velocity.select(1 if of_field else 0, across).zero_()
+    velocity.requires_grad_()
+    kinds = ["periodic"] * d
+    kinds[axis] = "wall"
+    flow = prdp.Flow(shape, 0.1, 0.01, boundary=kinds, wall_velocity={(axis, "high"): velocity}, solver=EXACT)
+    u = flow.project(0.1 * random_velocity(shape))
+    for states in (flow.rollout(u, 2), flow(u), flow.step_and_pressure(u)[1]):
+        (bar,) = torch.autograd.grad(states.square().sum(), velocity)
+        parts = bar.unbind(1 if of_field else 0)
+        assert not parts[across].any()
+        assert all(part.any() for c, part in enumerate(parts) if c != across) or states.shape[1] == 1

@@ -173,3 +173,10 @@ def test_one_eigenvalue_of_the_other_sign_is_found_among_many():
 
 def test_one_vector_of_a_matrix_is_an_example():
     assert prdp.check_operator(torch.eye(5, dtype=torch.float64), torch.ones(5, dtype=torch.float64))
+
+
+def test_a_nearly_singular_operator_that_takes_no_null_space_is_not_told_to_take_one():
+    example = torch.zeros(1, 1, 4, 5, dtype=torch.float64)
+    A = operators.Diffusion(torch.ones(1, 4, 5, dtype=torch.float64), shift=1e-14, boundary="flux")
+    with pytest.raises(ValueError, match="maps the constant to zero, so it is singular: enlarge the shift, or take a"):
+        prdp.check_operator(A, example)

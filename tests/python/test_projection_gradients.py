@@ -53,6 +53,7 @@ def used(name, all_inputs):
 @pytest.mark.parametrize("name", CASES)
 def test_loops_and_tensor_operations_make_the_same_step(name, diffusion, advection):
     u, nu, force, inflow = inputs(name, batch=3)
+    nu = 0.05 * nu if diffusion == "explicit" else nu
     flow = make(name, nu, force, inflow, diffusion=diffusion, advection=advection)
     recorded = make(name, nu, force, inflow, diffusion=diffusion, advection=advection, backward="unrolled")
     strided = u.detach().transpose(-1, -2).contiguous().transpose(-1, -2)

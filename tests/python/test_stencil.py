@@ -288,3 +288,11 @@ def test_a_coefficient_that_is_not_finite_leaves_no_number_of_its_sample(where, 
     c[where] = value
     found = operators.Stencil(c, [(0,), (-1,), (1,)], "zero").apply(v)
     assert found[0].isnan().all() and torch.equal(found[1], expected)
+
+
+@pytest.mark.parametrize("solver", [prdp.Jacobi(3), prdp.CG(3), prdp.GMRES(3), prdp.Direct(), prdp.Multigrid(3)])
+def test_an_empty_batch_of_coefficients_gets_an_empty_gradient(solver):
+    c, b = (torch.ones(0, n, 5, dtype=torch.float64, requires_grad=True) for n in (3, 1))
+    u, _ = prdp.linear_solve(operators.Stencil(c, [(0,), (1,), (-1,)]), b, solver)
+    u.sum().backward()
+    assert c.grad.shape == c.shape and b.grad.shape == b.shape

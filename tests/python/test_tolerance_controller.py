@@ -19,7 +19,9 @@ def test_the_tolerance_is_the_ratio_of_the_smallest_error_within_its_bounds(erro
     for i in range(len(errors) + 1):
         expected = max(1e-3, 0.2 * min([1.0, *errors[:i]])) if i else 1e-3  # as nothing is known
         assert heat.rtol == controller.rtol == pytest.approx(expected)
-        assert heat.adjoint_rtol == controller.adjoint_rtol == pytest.approx(max(1e-2, expected, min(0.1, 4 * expected)))
+        assert (
+            heat.adjoint_rtol == controller.adjoint_rtol == pytest.approx(max(1e-2, expected, min(0.1, 4 * expected)))
+        )
         assert (heat.max_iter, heat.adjoint_max_iter) == (10000, 2500)
         if i < len(errors):
             assert controller.step(errors[i]) == (controller.rtol < expected)

@@ -230,3 +230,13 @@ def test_making_data_is_shown_as_a_bar_and_reading_them_is_not(tmp_path):
     assert made.stdout.count("data, steps") == 1 and "26/26" in made.stdout
     assert "data" not in read.stdout and made.stderr == ""
     assert read.stderr.startswith("prdp: replaces when it ends: ") and read.stderr.count("\n") == 1
+
+
+def test_a_reference_shorter_than_the_pictures_want_is_shown_as_far_as_it_goes():
+    """As from a data file that ends soon after the step of the metric."""
+    scene = scenes.load("heat_2d")
+    states = torch.rand(2, scene.data.valid_steps + 1, 1, *scene.physics.shape)
+    short = trajectories.Trajectories(states, [trajectories.Course("auto", "auto", states, np.ones((1, 2)))], [])
+    figure = trajectory_charts.snapshots(scene, short)
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert titles[-1] == f"t = {scene.data.valid_steps}"

@@ -44,7 +44,8 @@ std::optional<SolveInfo> read(int64_t log) {
   return found == entry->second.end() ? std::nullopt : found->second;
 }
 
-void write(int64_t log, const SolveInfo& info) {
+void write(const c10::SymInt& to, const SolveInfo& info) {
+  const int64_t log = to.expect_int();
   std::optional<SolveInfo> other = info;  // the new one, and then the one before it
   const std::lock_guard lock(logs().mutex);
   const auto entry = logs().entries.find(log / Logs::kNumbers);

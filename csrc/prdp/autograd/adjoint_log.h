@@ -16,6 +16,6 @@ void close(int64_t log);
 
 /// The report of the last adjoint solve; nothing before the first backward pass, and for unknown numbers.
 std::optional<SolveInfo> read(int64_t log);
-void write(int64_t log, const SolveInfo& info);
+void write(const c10::SymInt& log, const SolveInfo& info);
 
 }  // namespace prdp::adjoint_log

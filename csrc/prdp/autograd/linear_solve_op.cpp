@@ -13,6 +13,7 @@
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/memory_check.h"
 #include "prdp/solvers/report_failures.h"
 #include "prdp/solvers/solve_on_gpu.h"
 
@@ -169,6 +170,7 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
 SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
                                     const at::Tensor& x0) {
   const auto a = checked_operator(spec, b, options, x0);
+  check_memory(options, b);
   const auto checks = checks_of(options.on_failure);
   a->check_parameters(gpu::may_run_kernel(b, options.solver) ? Checks::kHost : checks);
   if (!spec.transposed) {  // an adjoint solve follows one

@@ -131,7 +131,7 @@ inline SolveOptions unpack(const c10::List<std::string>& names, c10::SymIntArray
   detail::take_bits(counts[kRtolBits], o.solver.rtol, o.traced_rtol);
   detail::take_bits(counts[kAdjointRtolBits], o.adjoint_rtol, o.traced_adjoint_rtol);
   o.on_failure = on_failure_from_name(names.get(kOnFailure));
-  o.adjoint_log = count(kAdjointLog);
+  o.adjoint_log = counts[kAdjointLog];
   o.checkpoint_every = count(kCheckpointEvery);
   o.start = start_from_name(names.get(kStart));
   return o;

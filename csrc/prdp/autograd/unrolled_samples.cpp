@@ -160,7 +160,8 @@ class SampleVjps {
   void add_adjoint_solves(const Rows& rows, std::vector<at::Tensor>& sum, std::vector<SampleOutcome>& outcomes) {
     auto adjoint = options_;
     adjoint.backward = Backward::kImplicit;
-    adjoint.checkpoint_every = adjoint.adjoint_log = 0;
+    adjoint.checkpoint_every = 0;
+    adjoint.adjoint_log = 0;
     adjoint.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
     adjoint.adjoint_rtol = std::min(judged_rtol_, kRoundings / 2 * epsilon_of(solved_.b));
     const auto u = needs_gradient_of_a_ ? solution() : at::Tensor();

@@ -63,7 +63,7 @@ class Controller {
   /// were refined. Raises ValueError, and changes nothing, for a negative or non-finite metric; a schedule ignores it.
   virtual bool step(double metric, const Solves& solves = {}) = 0;
   const State& state() const { return state_; }
-  /// Restores a state. Raises ValueError, and changes nothing, for a state that these settings cannot have reached.
+  /// Restores a state. Raises ValueError, and changes nothing, for a state of numbers that no controller has.
   virtual void load_state(State state) = 0;
 
   /// What is wrong, or nothing: a sentence about the metric, one about the solves, or both.

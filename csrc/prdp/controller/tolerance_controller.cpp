@@ -25,8 +25,8 @@ double ToleranceController::rtol_for(double smallest) const {
 }
 
 double ToleranceController::adjoint_rtol() const {
-  // At 1/2 a Krylov method leaves out of the gradient what matters: its cosine with the exact one, of a field seen by two
-  // sensors, fell to 0.33, at 1/5 to 0.75, at 1/10 to 0.94, and emulators ended up to 18 times as far off.
+  // At 1/2 a Krylov method leaves out of the gradient what matters: its cosine with the exact one, of a field seen by
+  // two sensors, fell to 0.33, at 1/5 to 0.75, at 1/10 to 0.94, and emulators ended up to 18 times as far off.
   constexpr double loosest = 0.1;
   return std::max({rtol(), settings_.adjoint_floor, std::min(loosest, rtol() / settings_.adjoint_ratio)});
 }

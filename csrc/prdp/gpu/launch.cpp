@@ -6,6 +6,7 @@
 #include <limits>
 
 #include "prdp/gpu/fall_back.h"
+#include "prdp/gpu/kernel_text.h"
 #include "prdp/gpu/team_size.h"
 
 namespace prdp::gpu {
@@ -22,12 +23,12 @@ void check_count(int64_t count) {
 
 std::shared_ptr<const Kernel> kernel_of(Runtime& runtime, c10::Device device, const Body& body, const std::string& loop,
                                         const std::string& sizes, const TeamSize& team) {
-  const auto text =
-      c10::str("#include \"prdp/gpu/device/run_each.h\"\n#include \"", body.header,
-               "\"\nusing namespace prdp::gpu;\nusing Arguments = ", loop, "<", body.type,
-               ">;\nextern \"C\" __global__ void __launch_bounds__(", team.threads,
-               ") prdp_kernel(const __grid_constant__ Arguments arguments) { run", sizes, "(arguments); }\n");
-  auto kernel = runtime.kernel(device, {text, team.threads, /*block_memory=*/0, team.blocks});
+  KernelText text;
+  text << "#include \"prdp/gpu/device/run_each.h\"\n#include \"" << body.header
+       << "\"\nusing namespace prdp::gpu;\nusing Arguments = " << loop << "<" << body.type
+       << ">;\nextern \"C\" __global__ void __launch_bounds__(" << team.threads
+       << ") prdp_kernel(const __grid_constant__ Arguments arguments) { run" << sizes << "(arguments); }\n";
+  auto kernel = runtime.kernel(device, {text.str(), team.threads, /*block_memory=*/0, team.blocks});
   note_made(body.type);
   return kernel;
 }
@@ -51,8 +52,9 @@ SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int
   return or_fall_back([&] {
     check_count(points);
     const auto team = team_size(points, runtime->limits(device));
-    const auto sizes = c10::str("<", team.blocks, ", ", team.threads, ">");
-    SampleLoop loop{kernel_of(*runtime, device, body, "EachSample", sizes, team)};
+    KernelText sizes;
+    sizes << "<" << team.blocks << ", " << team.threads << ">";
+    SampleLoop loop{kernel_of(*runtime, device, body, "EachSample", sizes.str(), team)};
     loop.teams = loop.kernel->teams_for(batch, team.blocks);
     loop.memory = {team.blocks, loop.teams, at::TensorOptions().device(device)};
     return loop;

@@ -1,5 +1,7 @@
 #include "prdp/operators/singular_operator.h"
 
+#include <algorithm>
+
 #include "prdp/gpu/operator_view.h"
 #include "prdp/gpu/part_of.h"
 #include "prdp/kernels/kernel.h"
@@ -103,7 +105,7 @@ std::optional<OperatorSpec> stencil_of(const Operator& a) {
 template <class Product>
 at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const at::Tensor& q_left,
                          const Product& product) {
-  const int64_t batch = b.size(0), n = b.numel() / batch, channels = n / q_right.size(-1);
+  const int64_t batch = b.size(0), n = b.numel() / std::max<int64_t>(batch, 1), channels = n / q_right.size(-1);
   check_dense_fits(b, n, batch);
   const auto a = matrix_by_columns(product, b);
   const auto q = at::kron(at::eye(channels, b.options()), at::matmul(q_left.mT(), q_right));

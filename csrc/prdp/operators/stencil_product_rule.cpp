@@ -18,6 +18,7 @@ template <class T>
 void add_all_products(const kernels::StencilSparsity& pattern, const at::Tensor& lambda, const at::Tensor& u,
                       const at::Tensor& products) {
   const int64_t samples = lambda.size(0), channels = lambda.size(1), given = products.size(1);
+  if (products.numel() == 0) return;  // an empty batch
   const int64_t points = products.numel() / (products.size(0) * given);
   const int64_t share = products.size(0) == 1 ? samples : 1;  // samples that add up to one product
   const auto *l = lambda.const_data_ptr<T>(), *v = u.const_data_ptr<T>();

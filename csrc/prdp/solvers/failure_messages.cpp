@@ -220,6 +220,8 @@ std::string max_iter_reached(const FailedSample& sample) {
     return c10::str("its residual is above the rounding of a product, though u may be right; ",
                     single ? "solve it in float64 once to see" : "scale A and b",
                     ", or refine it by a larger max_iter");
+  if (sample.method().made_for == MadeFor::kSymmetric)
+    return "take CG if A is positive definite; else more iterations, a preconditioner, float64 or Direct";
   return "take more iterations, a preconditioner, GMRES or Direct";
 }
 

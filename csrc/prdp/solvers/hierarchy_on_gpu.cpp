@@ -2,9 +2,9 @@
 
 #include <algorithm>
 #include <limits>
-#include <sstream>
 #include <vector>
 
+#include "prdp/gpu/kernel_text.h"
 #include "prdp/gpu/team_memory.h"
 #include "prdp/gpu/team_size.h"
 #include "prdp/kernels/coarsening.h"
@@ -74,7 +74,7 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
   auto limits = runtime.limits(b.device());
   limits.threads = std::min(limits.threads, kMostThreads);
   const auto [blocks, threads] = team_size(points, limits);
-  std::ostringstream text;
+  KernelText text;
   text << "#include \"prdp/gpu/device/hierarchy.h\"\nusing namespace prdp::gpu;\n"
        << "using S = HierarchySetting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << b.dim() - 2 << ", "
        << blocks << ", " << threads << ">;\n"

@@ -2,8 +2,8 @@
 
 #include <algorithm>
 #include <limits>
-#include <sstream>
 
+#include "prdp/gpu/kernel_text.h"
 #include "prdp/gpu/team_size.h"
 #include "prdp/solvers/hierarchy_on_gpu.h"
 #include "prdp/solvers/methods.h"
@@ -29,7 +29,7 @@ struct Sizes {
 
 std::string text_of(const Sizes& sizes, const OperatorView& a, const Solver& solver, const at::Tensor& b) {
   const auto& row = traits(solver.method);
-  std::ostringstream text;
+  KernelText text;
   text << "#include \"prdp/gpu/device/solve.h\"\n#include \"prdp/solvers/" << row.kernel_header << "\"\n"
        << "using namespace prdp::gpu;\n"
        << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", ";

@@ -61,7 +61,8 @@ void check_budget(const char* who, const char* prefix, const c10::SymInt& max_it
   // A symbolic max_iter is checked when its number is known, as the graph runs.
   const bool is_missing = !max_iter.is_symbolic() && max_iter.expect_int() == kToBeGiven;
   TORCH_CHECK_VALUE(max_iter.is_symbolic() || max_iter.expect_int() >= 0, who, ": ", prefix,
-                    "max_iter must be >= 0, got ", max_iter, is_missing ? in_language("", ", as none was given") : "");
+                    "max_iter must be >= 0, got ", max_iter,
+                    is_missing ? in_language("", " (which it is where none is given)") : "");
   TORCH_CHECK_VALUE(rtol >= 0.0, who, ": ", prefix, "rtol must be >= 0, got ", rtol);
   TORCH_CHECK_VALUE(rtol < 1.0, who, ": ", prefix, "rtol must be < 1, got ", rtol, "; u = 0 would meet it");
 }

@@ -208,7 +208,7 @@ struct SolveOptions {
   std::optional<c10::SymInt> adjoint_max_iter{};  // by default those of the solver
   std::optional<double> adjoint_rtol{};
   OnFailure on_failure = OnFailure::kRaise;
-  int64_t adjoint_log = 0;  // the log that gets the report of the adjoint solve (adjoint_log.h); 0: none
+  c10::SymInt adjoint_log = 0;  // the log that gets the report of the adjoint solve (adjoint_log.h); 0: none
   /// With n > 0, unrolled mode stores every n-th iterate and recomputes the others; 0 stores all.
   int64_t checkpoint_every = 0;
   Start start = Start::kZero;  // only for steps and rollouts; linear_solve() has the argument x0

@@ -9,7 +9,6 @@
 #include "prdp/autograd/op_results.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/steppers/equation_kinds.h"
-#include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/packed_equation.h"
 #include "prdp/steppers/stepper.h"
 
@@ -64,7 +63,6 @@ SolveInfo joined(const SolveInfo& before, const SolveInfo& last) {
 }
 
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {
-  check_memory(options, u);
   const auto b = equation_rhs(equation, u);
   const auto solve_about = [&](const at::Tensor& state) {
     return linear_solve(equation_operator(equation, state), b, options, start_of_step(options, state));

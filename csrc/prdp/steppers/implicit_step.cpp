@@ -2,7 +2,6 @@
 
 #include "prdp/autograd/detach_failed.h"
 #include "prdp/solvers/solve.h"
-#include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/rollout_loops.h"
 
 namespace prdp {
@@ -20,7 +19,6 @@ ImplicitStep::ImplicitStep(OperatorSpec a, RhsAt rhs, Solver solver, Backward ba
 
 SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const {
   TORCH_CHECK_VALUE(u.dim() >= 2, who_, ": u must have shape (batch, ...), got ", u.sizes());
-  check_memory(options_, u);
   const bool may_lose = options_.on_failure != OnFailure::kRaise && u.requires_grad();
   if (!may_lose || u.is_cpu()) {
     auto result = solve_from(u, adjoint_log);

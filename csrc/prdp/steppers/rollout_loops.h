@@ -57,7 +57,7 @@ SolveResult solve_in_place(const at::Tensor& u, int64_t solves, int64_t of_step,
 /// The reverse, from the cotangent (batch, solves + 1, …) of the solutions: `back(s)` takes the cotangent of solution
 /// s + 1 through solve s and returns the report of its adjoint solve, if there is one. The log gets all of them.
 template <class Back>
-void solve_by_solve_back(const at::Tensor& cotangent, int64_t of_step, int64_t log, const Back& back) {
+void solve_by_solve_back(const at::Tensor& cotangent, int64_t of_step, const c10::SymInt& log, const Back& back) {
   const int64_t solves = cotangent.size(1) - 1;
   std::vector<SolveInfo> infos;
   for (int64_t s = solves - 1; s >= 0; --s) {

@@ -5,8 +5,8 @@
 #include <limits>
 
 #include "prdp/operators/kinds.h"
+#include "prdp/solvers/memory_check.h"
 #include "prdp/solvers/solve.h"
-#include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/packed_equation.h"
 #include "prdp/steppers/rollout.h"
 #include "prdp/steppers/rollout_loops.h"

@@ -1,5 +1,7 @@
 #include "prdp/steppers/steppers.h"
 
+#include <c10/core/InferenceMode.h>
+
 #include <algorithm>
 
 #include "prdp/operators/kinds.h"
@@ -17,7 +19,15 @@ std::vector<double> parameters(std::vector<double> first, const Length& length, 
   return first;
 }
 
+/// Outside of inference mode: a tensor made in it could be kept for no gradient.
+at::Tensor number(double value) {
+  const c10::InferenceMode ended(false);
+  return at::scalar_tensor(value, at::kDouble);
+}
+
 }  // namespace
+
+Viscosity::Viscosity(double nu) : tensor(number(nu)) {}
 
 Stepper::Stepper(Equation equation, SolveOptions options)
     : StepperBase(operator_kind(equation.kind).title, std::move(options)), equation_(std::move(equation)) {

@@ -42,7 +42,7 @@ class Poisson : public Stepper {
 
 /// nu >= 0 in length²/time: a number, or a 0-dimensional tensor, which gets a gradient.
 struct Viscosity {
-  Viscosity(double nu) : tensor(at::scalar_tensor(nu, at::kDouble)) {}
+  Viscosity(double nu);
   Viscosity(at::Tensor nu) : tensor(std::move(nu)) {}
   at::Tensor tensor;
 };

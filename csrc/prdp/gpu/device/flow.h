@@ -5,6 +5,16 @@
 /// The explicit part of a step of a flow.
 namespace prdp::gpu {
 
+/// The largest Courant number of an explicit advection, for a ν.
+struct CourantLimit {
+  double free_per_nu = 0, taken_per_nu = 0;
+
+  double at(double nu) const {
+    const double free = std::sqrt(nu * free_per_nu), left = (free > 1.0 ? free : 1.0) - nu * taken_per_nu;
+    return left > 0.0 ? left : 0.0;
+  }
+};
+
 /// u with its boundary values and ghosts, and what is wrong with a sample: 0, or why it cannot be advected; then all
 /// is zero.
 template <class T>
@@ -12,7 +22,8 @@ struct FlowStart {
   FlowBoundaryValues<T> boundary;
   FlowField<const T> force;
   FlowNumber<T> nu;
-  double dt, free_per_nu;  // of the Courant number: at least 1, or √(ν free_per_nu)
+  double dt;
+  CourantLimit limit;
   FlowField<T> padded;
   int64_t* status;
 
@@ -21,8 +32,7 @@ struct FlowStart {
     const auto& grid = boundary.grid;
     const T courant = largest_of(team, grid.cells(), [&](int i) { return courant_at(s, grid.place(i)); });
     const T given = largest_of(team, grid.cells(), [&](int i) { return given_at(s, grid.place(i)); });
-    const double limit = std::sqrt(static_cast<double>(nu.value()) * free_per_nu);
-    const bool slow = std::isfinite(courant) && courant <= static_cast<T>(limit > 1.0 ? limit : 1.0);
+    const bool slow = std::isfinite(courant) && courant <= static_cast<T>(limit.at(static_cast<double>(nu.value())));
     const auto verdict = !std::isfinite(given) ? SolveStatus::kNonfiniteInput
                          : slow                ? SolveStatus{}
                                                : SolveStatus::kDiverged;

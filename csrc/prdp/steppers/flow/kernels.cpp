@@ -5,6 +5,7 @@
 #include "prdp/gpu/device/flow_pressure.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/steppers/flow/kernel_fields.h"
+#include "prdp/steppers/flow/limits.h"
 
 namespace prdp::flow_kernels {
 
@@ -53,7 +54,6 @@ std::optional<PaddedVelocity> pad_velocity(const FlowEquation& e, const at::Tens
   PaddedVelocity found{{}, at::empty(sizes, u.options()), at::empty({batch}, u.options().dtype(at::kLong))};
   found.velocity = found.padded;
   for (int64_t axis = 0; axis < d; ++axis) found.velocity = found.velocity.narrow(axis + 2, 1, box.shape()[axis]);
-  const bool grows_with_nu = e.advection == FlowAdvection::kCentral && e.is_diffused_implicitly();
   const bool launched = each_sample({"FlowStart", kFlow}, u, d * cells_of(box), [&]<class T>(T) {
     gpu::FlowStart<T> of{.boundary = {.grid = grid_of(box),
                                       .u = field_of<const T>(u),
@@ -64,7 +64,7 @@ std::optional<PaddedVelocity> pad_velocity(const FlowEquation& e, const at::Tens
                          .force = field_of<const T>(e.force),
                          .nu = number_of<T>(e.nu),
                          .dt = e.dt,
-                         .free_per_nu = grows_with_nu ? e.dt * box.sum_of_couplings() / static_cast<double>(d) : 0.0,
+                         .limit = courant_limit(e),
                          .padded = field_of<T>(found.padded),
                          .status = data_of<int64_t>(found.status)};
     for (int64_t axis = 0; axis < d; ++axis)

@@ -15,13 +15,7 @@ namespace prdp {
 
 namespace {
 
-/// The largest Courant number. A step of explicit Euler with central differences lets no wave grow up to √(2 ν dt/dx²)
-/// where diffusion is implicit. Up to 1 waves grow slowly at most.
-double largest_courant_number(const FlowEquation& e) {
-  if (e.advection == FlowAdvection::kUpwind || e.diffusion == FlowDiffusion::kExplicit) return 1.0;
-  return std::max(
-      1.0, std::sqrt(e.nu.item<double>() * e.dt * e.box->sum_of_couplings() / static_cast<double>(e.box->dim())));
-}
+double largest_courant_number(const FlowEquation& e) { return courant_limit(e).at(e.nu.item<double>()); }
 
 /// What is not finite in sample i: the inflow that makes the boundary values of u, the force, a wall, or u.
 std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i) {
@@ -41,6 +35,14 @@ std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i
 }
 
 }  // namespace
+
+gpu::CourantLimit courant_limit(const FlowEquation& e) {
+  const bool is_upwind = e.advection == FlowAdvection::kUpwind;
+  if (!e.is_diffused_implicitly()) return {.taken_per_nu = is_upwind ? e.dt * e.box->sum_of_couplings() : 0.0};
+  double dx = 0;
+  for (int64_t axis = 0; axis < e.box->dim(); ++axis) dx = std::max(dx, e.box->dx(axis));
+  return {.free_per_nu = is_upwind ? 0.0 : 2 * e.dt / (dx * dx)};
+}
 
 RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
   const at::NoGradGuard no_grad;

@@ -1,8 +1,14 @@
 #pragma once
+#include "prdp/gpu/device/flow.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/steppers/flow/equation.h"
 
 namespace prdp {
+
+/// With central differences and implicit diffusion a step of explicit Euler lets no wave grow up to √(2 ν dt)/dx, for
+/// the dx along the wind, which may be the largest. Up to 1 waves grow slowly. An explicit step of upwind advection and
+/// diffusion is a mean of neighbours while the two numbers are at most 1 together.
+gpu::CourantLimit courant_limit(const FlowEquation& equation);
 
 /// The samples that cannot be advected: their step is too long, or they or their force are not finite.
 struct RefusedSamples {

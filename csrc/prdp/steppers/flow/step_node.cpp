@@ -124,7 +124,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
                                             at::IntArrayRef needed) {
     std::vector<at::Tensor> sums(needed.size());
     auto bar = cotangent.select(1, call.steps);
-    const int64_t log = at::GradMode::is_enabled() ? 0 : call.options.adjoint_log;
+    const auto log = at::GradMode::is_enabled() ? c10::SymInt(0) : call.options.adjoint_log;
     solve_by_solve_back(cotangent, 1, log, [&](int64_t s) {
       const auto status_of_step = status.defined() ? status.select(1, s) : status;
       std::vector<int64_t> wanted = needed.vec();
@@ -141,6 +141,21 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     return sums;
   }
 };
+
+/// With walls whose component through them, which must be 0, gets no gradient.
+FlowEquation with_gradients_along_walls(FlowEquation e) {
+  for (size_t i = 0; i < e.wall_velocity.size(); ++i) {
+    auto& velocity = e.wall_velocity[i];
+    if (!velocity.defined() || !velocity.requires_grad()) continue;
+    const int64_t channel = velocity.dim() == 1 ? 0 : 1;
+    std::vector<int64_t> sizes(velocity.dim(), 1);
+    sizes[channel] = e.box->dim();
+    auto along = at::ones(sizes, velocity.options().requires_grad(false));
+    along.select(channel, e.box->channel_of(static_cast<int64_t>(i) / 2)).zero_();
+    velocity = velocity * along;
+  }
+  return e;
+}
 
 }  // namespace
 
@@ -167,7 +182,7 @@ SolveResult flow_steps(const FlowEquation& equation, const at::Tensor& u, int64_
     return forward_steps(equation, u.detach(), steps, output, options);
   }
   auto call = c10::make_intrusive<Call>();
-  const auto tensors = or_empty(equation.tensors(), u);
+  const auto tensors = or_empty(with_gradients_along_walls(equation).tensors(), u);
   call->equation = equation.with_tensors(std::vector<at::Tensor>(tensors.size()));
   call->steps = steps;
   call->output = output;

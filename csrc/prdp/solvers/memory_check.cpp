@@ -1,4 +1,4 @@
-#include "prdp/steppers/memory_check.h"
+#include "prdp/solvers/memory_check.h"
 
 #include <ATen/Parallel.h>
 #include <unistd.h>
