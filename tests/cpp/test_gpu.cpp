@@ -1,6 +1,7 @@
 #include <gtest/gtest.h>
 
 #include <cstdlib>
+#include <locale>
 
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
@@ -39,6 +40,24 @@ TEST(Gpu, ASolveWithItsGradientIsTwoLaunchesWithoutPython) {
   };
   EXPECT_LT(error(u, b), 1e-10);
   EXPECT_LT(error(leaf.grad(), weights), 1e-10);
+}
+
+struct Grouped : std::numpunct<char> {
+  char do_thousands_sep() const override { return ','; }
+  std::string do_grouping() const override { return "\3"; }
+};
+
+TEST(Gpu, TheTextOfAKernelHasNoSeparatorsOfTheUsersLocale) {
+  const prdp::gpu::Limits limits{.block_memory = 96 << 10, .cells_of_block = 16384, .threads = 1024, .blocks = 132};
+  const auto text = [&] {
+    const auto b = at::zeros({1}).expand({2, 1, 1 << 20});
+    return prdp::gpu::solve_kernel({.type = "Heat<float>"}, false, prdp::CG{}, b, limits).source.text;
+  };
+  const auto expected = text();
+  const auto before = std::locale::global(std::locale(std::locale::classic(), new Grouped));
+  const auto found = text();
+  std::locale::global(before);
+  EXPECT_EQ(found, expected);
 }
 
 /// Kernels count by an int. Up to there a team of all blocks takes any sample, some points a thread.

@@ -1,8 +1,10 @@
+#include <c10/core/InferenceMode.h>
 #include <gtest/gtest.h>
 #include <torch/csrc/autograd/autograd.h>
 
 #include <functional>
 #include <limits>
+#include <optional>
 
 #include "helpers.h"
 #include "prdp/prdp.h"
@@ -268,6 +270,23 @@ std::string said(const F& f) {
   return "nothing";
 }
 
+TEST(Stepper, OneMadeInInferenceModeHasGradientsLater) {
+  std::optional<prdp::Heat> heat;
+  std::optional<prdp::Flow> flow;
+  {
+    const c10::InferenceMode inference;
+    heat.emplace(std::vector<int64_t>{8}, 1e-2, 1.0, prdp::CG{.max_iter = 60, .rtol = 1e-12});
+    flow.emplace(std::vector<int64_t>{8, 8}, 1e-2, 1e-3);
+  }
+  const auto u = prdp_test::random_field({8}, 2).requires_grad_();
+  (*heat)(u).sum().backward();
+  const auto a = at::eye(8, at::kDouble) - 1e-2 * dense_laplacian({8});
+  EXPECT_TRUE(at::allclose(u.grad()[1][0], at::linalg_solve(a, at::ones({8}, at::kDouble)), 1e-9, 1e-12));
+  const auto velocity = at::zeros({1, 2, 8, 8}, at::kDouble).requires_grad_();
+  (*flow)(velocity).sum().backward();
+  EXPECT_TRUE(velocity.grad().defined());
+}
+
 TEST(Stepper, WhatMakesNoStepSaysWhy) {
   const auto u = at::ones({1, 1, 8}, at::kDouble);
   const prdp::Solver cg = prdp::CG{.max_iter = 20};
@@ -275,7 +294,7 @@ TEST(Stepper, WhatMakesNoStepSaysWhy) {
   EXPECT_EQ(said([&] { heat(at::Tensor()); }), "Heat: u is an undefined tensor");
   EXPECT_EQ(said([&] { heat.rollout(u.to_sparse(), 2); }), "Heat: u must be a dense tensor, got the layout Sparse");
   EXPECT_EQ(said([&] { prdp::Heat({8}, 1e-2, 1.0, prdp::CG{}); }),
-            "Heat: max_iter must be >= 0, got -1, as none was given");
+            "Heat: max_iter must be >= 0, got -1 (which it is where none is given)");
 
   auto step = prdp::ImplicitStep(prdp::diffusion(at::ones({1, 8}, at::kDouble)), nullptr, cg);
   auto flow = prdp::Flow({8, 8}, 1e-2, 1e-3);
