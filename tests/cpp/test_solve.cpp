@@ -172,6 +172,7 @@ TEST(Matrix, OnlySquareOnesWithIndicesInRangeAreTaken) {
   const auto b = at::ones({2, 3}, at::kDouble);
   const prdp::SolveOptions options{prdp::CG{.max_iter = 5}};
   EXPECT_TRUE(at::allclose(prdp::linear_solve(prdp::matrix(eye.to_sparse_csr()), b, options).u, b));
+  EXPECT_THROW(prdp::linear_solve(prdp::matrix(eye), eye.to_sparse(), options), c10::ValueError);
   auto spoilt = prdp::matrix(eye.to_sparse_csr());
   spoilt.tensors[1] = at::tensor({0, 1, 3}, at::kLong);
   EXPECT_THROW(prdp::linear_solve(spoilt, b, options), c10::ValueError);

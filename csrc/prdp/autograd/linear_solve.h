@@ -25,8 +25,8 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
 SolveResult linear_solve_unrecorded(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                                     const at::Tensor& x0 = {});
 
-/// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator. Raises ValueError for other shapes. In C++ a
-/// sparse tensor has no gradient: LibTorch makes it without one, even of values that require it.
+/// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator. Raises ValueError for other shapes. A sparse
+/// tensor gets a gradient where it is a leaf: LibTorch makes it of values without recording that.
 OperatorSpec matrix(const at::Tensor& values);
 
 /// A sparse matrix by its compressed rows, whose values get a gradient. crow: (n + 1,), where each row starts; col:

@@ -160,6 +160,9 @@ SolveOutputs autograd_op(const at::Tensor& b, Args... args) {
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                          const at::Tensor& x0) {
   TORCH_CHECK_VALUE(b.defined(), "linear_solve: b is an undefined tensor");
+  for (const auto* t : {&b, &x0})
+    TORCH_CHECK_VALUE(!t->defined() || t->layout() == at::kStrided, "linear_solve: ", t == &b ? "b" : "x0",
+                      " must be a dense tensor, got the layout ", t->layout());
   const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
   if (!lone_vector) return result_of(solve_or_dispatch(b, a, options, x0));
   auto result = result_of(solve_or_dispatch(b.unsqueeze(0), a, options, x0.defined() ? x0.unsqueeze(0) : x0));

@@ -63,6 +63,7 @@ SolveInfo joined(const SolveInfo& before, const SolveInfo& last) {
 }
 
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {
+  equation.check_picard_steps();
   const auto b = equation_rhs(equation, u);
   const auto solve_about = [&](const at::Tensor& state) {
     return linear_solve(equation_operator(equation, state), b, options, start_of_step(options, state));

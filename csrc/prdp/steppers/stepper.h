@@ -31,7 +31,7 @@ class StepperBase {
 
   /// The report of the last step or rollout; nothing before the first.
   const std::optional<SolveInfo>& info() const { return info_; }
-  /// The report of the last backward pass; nothing before the first.
+  /// The report of the last backward pass; nothing before the first. Unrolled derivatives have no residual: NaN.
   std::optional<SolveInfo> adjoint_info() const;
   /// Whether all samples met the tolerance, in the last step and in its adjoint solve if there was one.
   bool converged() const;
