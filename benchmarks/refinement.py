@@ -64,7 +64,7 @@ def _tolerance(label, title, **settings):
 
 
 def _constant(rtol, solver=None):
-    """One tolerance throughout. The start, the adjoint's share and the cap on K are those of auto."""
+    """One tolerance throughout, ten times as large for the adjoint, but at most 1/2. Start and cap on K are auto's."""
 
     def attach(steppers):
         start_from_states(steppers)

@@ -65,10 +65,10 @@ class _Attached(_Compiled):
             super().__setattr__(name, value)
 
     def _push(self) -> None:
-        budget = {name: value for name, value in self._budget.items() if value is not None}
-        for stepper in self.steppers:
-            for name, value in budget.items():
-                setattr(stepper, name, value)
+        for name, value in self._budget.items():
+            for stepper in self.steppers if value is not None else ():
+                if getattr(stepper, name) != value:  # to set one takes a check of all settings
+                    setattr(stepper, name, value)
 
     def _decide(self, metric: float, converged: bool | None, error: float | None) -> bool:
         """One step of the compiled controller, and what follows from it for the steppers."""
@@ -190,7 +190,6 @@ class PRDPController(_C.PRDPController, _Attached):
     - Most of the last solves took no iteration though their residual is above 1e-4: steps pass their start on.
     - The metric grows: it was more than twice its least value, three times in a row.
     - The last `step` raised an error for its metric.
-    - Of a `ToleranceController`: the error has not fallen in twenty calls, and adjoint solves are loose.
 
     Raises:
         ValueError, TypeError: a setting or a metric is out of range or of a wrong type.
@@ -249,8 +248,8 @@ class ToleranceController(_C.ToleranceController, _Attached):
             after every step. It may be empty; then read `.rtol`, `.adjoint_rtol` and `.max_iter` yourself.
         ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1), 0.1 by default; rtol is 1e-3 before the
             first `step`.
-        adjoint_ratio: the rtol of the adjoint solve is min(1/10, rtol / adjoint_ratio), and its K is ⌈adjoint_ratio·K⌉;
-            in (0, 1], 0.1 by default.
+        adjoint_ratio: the rtol of the adjoint solve is min(1/10, rtol / adjoint_ratio), but at least rtol and
+            adjoint_floor, and its K is ⌈adjoint_ratio·K⌉; in (0, 1], 0.1 by default.
         floor: the smallest rtol; in (0, 1), 1e-5 by default, which solves in float32 reach.
         adjoint_floor: the smallest rtol of the adjoint solve; in (0, 1), 0.01 by default. That rtol is relative to a
             cotangent that shrinks with the error, and a descent needs no better gradient late than early.

@@ -52,15 +52,15 @@ class Flow(HoldsTensors, Stepper):
             first order and stable without viscosity.
         diffusion: "implicit" solves with `solver`, and "explicit" needs nu dt Σ 2/dx² <= 1.
         pressure: "incremental" takes the pressure of all forces off before the implicit diffusion, by one more solve.
-            Steady flows then do not depend on dt, up to nu dt/dx² = 4, or 1.25 with an obstacle and a periodic axis.
+            Steady flows then do not depend on dt, up to nu dt/dx² = 4, with an obstacle 1.25 in 2D and 0.6 in 3D.
             "plain" leaves the pressure to the projection after it. The two are the same with explicit diffusion, and
             in a periodic box without obstacle.
         solver: for the pressure and the implicit diffusion, both symmetric. CG(100) with multigrid by default.
         backward and the other options: as in `Stepper`, but `start` must be "zero".
 
-    `nu`, `force`, `inflow`, `wall_velocity`, `obstacle`, `dt` and `advection` may be set at any time. A tensor that is
-    set later is for the steps that follow, as the output of a network is: it is no state, so that copies and
-    `state_dict` have what was there before. A Parameter, a `torch.nn.Buffer` and numbers are state.
+    All but `shape` may be set at any time. A tensor that is set later as `nu`, `force`, `inflow` or `wall_velocity` is
+    for the steps that follow, as the output of a network is: it is no state, so that copies and `state_dict` have what
+    was there before. A Parameter, a `torch.nn.Buffer`, numbers and `obstacle` are state.
 
     `info` combines the solves of a step: it has the sum of their iterations, the worst status and the largest residual.
     Each step stores one state for the backward pass, and computes the rest again.

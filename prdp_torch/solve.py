@@ -137,7 +137,7 @@ class SolveInfo(NamedTuple):
     @property
     def solved(self) -> Tensor:
         """Which samples are solved (bool): they met the tolerance, or came as near as their dtype allows. With rtol = 0
-        none does."""
+        only those do whose residual is 0."""
         return (self.status > 0) | (self.floor > 0)
 
     @property

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import sys
+import traceback
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -74,10 +75,17 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             raise
         except (ValueError, TypeError, OSError, ImportError, RuntimeError, OverflowError, MemoryError) as error:
             words = "std::bad_alloc" if isinstance(error, MemoryError) else str(error)
-            print(f"prdp: {sentence(words)}", file=sys.stderr)
+            print(f"prdp: {sentence(words)}{_place(error)}", file=sys.stderr)
             raise typer.Exit(2) from None
 
     return app.command(name=function.__name__)(guarded)
+
+
+def _place(error: BaseException) -> str:
+    """The line of the user's own file that raised it or led to it, as of a network; empty where there is none."""
+    others = str(Path(__file__).parents[1]), sys.prefix, sys.base_prefix, "<"
+    own = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(others)]
+    return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
 
 
 @command

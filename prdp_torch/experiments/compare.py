@@ -119,7 +119,7 @@ def rows_of(scene: _C.Scene) -> list[Row]:
         start, step = scene.compare.schedule
         schedule = Refinement.schedule(start, step, converged)
         rows.append(Row(schedule.label, f"schedule {start} + {step}", "schedule", schedule))
-    for k in scene.compare.constant:
+    for k in dict.fromkeys(scene.compare.constant):
         if k != converged:
             rows.append(Row(f"constant_{k}", f"K = {k}", "constant", Refinement.constant(k), k))
     return rows

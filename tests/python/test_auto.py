@@ -48,6 +48,13 @@ def test_prdp_with_its_defaults_ends_like_converged_solves_or_warns(tmp_path, na
     assert not false_alarms
 
 
+def test_a_constant_k_that_is_given_twice_is_trained_once(tmp_path):
+    scene = scenes.load(
+        written(tmp_path, ("constant = [1, 2, 3, 5, 7, 10, 15, 25]", "constant = [2, 2]"), scene="heat_1d")
+    )
+    assert [row.label for row in compare.rows_of(scene)].count("constant_2") == 1
+
+
 def test_a_fall_in_the_metric_is_no_proof():
     """PRDP's defaults stop at K = 18 where the unknowns make up for the solver's error: the misfit is small."""
     scene = scenes.load("poisson_3p")

@@ -97,9 +97,8 @@ def test_the_cpp_trainer_refuses_a_file(tmp_path):
     pdebench.write(tmp_path / "x.h5", random_trajectories(scene), scene)
     done = subprocess.run([TRAINER, scene.path, "--out", tmp_path / "cpp"], capture_output=True, text=True)
     assert done.returncode == 2
-    assert done.stderr.endswith(
-        f"data.file: only the Python trainer reads HDF5 and .npz; run prdp train {scene.path}\n"
-    )
+    words = f"data.file: only prdp train and prdp compare read it, with the states of {scene.path}\n"
+    assert done.stderr.endswith(words)
 
 
 @pytest.mark.parametrize("zeros", [slice(None), slice(3, 4), slice(51, 52)])

@@ -128,6 +128,27 @@ def test_the_command_trains_it_wherever_it_is_called(tmp_path, module):
     assert prdp.load_trained(tmp_path / "run").network.mask.isinf().all()
 
 
+def test_an_error_inside_a_network_names_its_line(tmp_path, module):
+    source = (
+        SOURCE.format(more="")
+        + """
+
+class Late(Net):
+    def forward(self, u):
+        if len(u) > 5:
+            raise ValueError("a mistake of mine")
+        return super().forward(u)
+"""
+    )
+    (tmp_path / f"{module}.py").write_text(source)
+    scene = scene_with(tmp_path, f"{module}:Late")
+    command = [sys.executable, "-m", "prdp_torch", "train", scene, "--out", tmp_path / "run", "--intervals", "1"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    line = source.splitlines().index('            raise ValueError("a mistake of mine")') + 1
+    assert done.stderr.endswith(f"prdp: a mistake of mine ({module}.py, line {line})\n")
+
+
 def test_a_changed_class_is_another_training_and_load_trained_warns(tmp_path, module):
     scene = scenes.load(scene_with(tmp_path, f"{module}:Net"))
     trained(scene, tmp_path / "run", intervals=1)

@@ -47,6 +47,7 @@ def an_example(value):
         "table": ({}, 1),
         "table, or text `module:Class`": ({}, "Class"),
         "numbers": ([1.0], 1.0),
+        "number in (0, 1]": (0.5, 1.5),
         "text": ("x", 1),
         "`true`, `false`": (True, 1),
     }

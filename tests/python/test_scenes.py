@@ -70,6 +70,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
         ("learning_rate = 1e-3", "learning_rate = nan", "learning_rate", "training.learning_rate: must be finite"),
         ('loss = "nmse"', 'loss = "l1"', "loss =", "training.loss: unknown name 'l1'; allowed: nmse, mse"),
         ("delta = 3", "delta = 1", "delta", "prdp.delta: must be >= 2, got 1"),
+        ("delta = 3", "delta = 3\nadjoint_ratio = 1.5", "adjoint_ratio", "prdp.adjoint_ratio: must be <= 1, got 1.5"),
         ('dtype = "float32"', 'dtype = "half"', "dtype", "dtype: unknown name 'half'; allowed: float32, float64"),
         ('"implicit"', '"none"', "backward", "solver.backward: 'none' is only for `corrector`"),
         ("valid_steps = 2", "valid_steps = 0", "valid_steps", "data.valid_steps: must be >= 1, got 0"),

@@ -46,6 +46,31 @@ def test_a_slow_flow_through_a_throat_decays(throat, number):
     assert growth(flow, slow) < 1
 
 
+@pytest.mark.parametrize("number", [1.25, 2.0, 3.0, 4.0, 6.0, 16.0])
+@pytest.mark.parametrize("boundary", [("wall", "open"), "wall", ("wall", "periodic")])
+def test_a_slow_flow_around_a_block_near_a_wall_decays(boundary, number):
+    solid = torch.zeros(31, 60, dtype=torch.bool)
+    solid[21:30, 20:24] = True
+    rest = {"inflow": [0.0, 0.0]} if "open" in boundary else {}
+    flow = prdp.Flow((31, 60), number, 1.0, boundary, (31.0, 60.0), solid, solver=EXACT, **rest)
+    assert growth(flow, flow.project(1e-30 * random_velocity((31, 60)))) < 1
+
+
+@pytest.mark.parametrize("number", [1.25, 2.0, 4.0, 8.0])
+def test_a_slow_flow_through_a_winding_throat_on_stretched_cells_decays(number):
+    solid = torch.zeros(3, 40, dtype=torch.bool)
+    solid[1:, 0] = solid[:2, 2] = True  # two plates, with holes at opposite ends
+    flow = prdp.Flow((3, 40), number / 16, 1.0, ("wall", "periodic"), (3.0, 10.0), solid, solver=EXACT)
+    assert growth(flow, flow.project(1e-30 * random_velocity((3, 40)))) < 1
+
+
+def test_an_obstacle_without_a_solid_cell_is_none():
+    u = 1e-3 * random_velocity((8, 8))
+    options = {"boundary": ("wall", "periodic"), "length": 8.0, "solver": EXACT}
+    with_mask = prdp.Flow((8, 8), 2.0, 1.0, obstacle=torch.zeros(8, 8, dtype=torch.bool), **options)
+    assert torch.equal(with_mask(u), prdp.Flow((8, 8), 2.0, 1.0, **options)(u))
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("stretched", [1.0, 3.0, 10.0])
 def test_an_accepted_wind_along_long_or_short_cells_lets_no_wave_grow(axis, stretched):

@@ -15,11 +15,11 @@ class ProductRows {
   /// Contiguous memory for the next pair. Call push() after writing it.
   template <class T>
   T* lambda() const {
-    return lambda_.select(0, count_).template mutable_data_ptr<T>();
+    return lambda_.template mutable_data_ptr<T>() + count_ * lambda_.stride(0);
   }
   template <class T>
   T* v() const {
-    return v_.select(0, count_).template mutable_data_ptr<T>();
+    return v_.template mutable_data_ptr<T>() + count_ * v_.stride(0);
   }
   void push();
   /// One per tensor of A; undefined where there is no derivative.

@@ -116,13 +116,14 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   };
   std::vector<at::Tensor> products;
   // An overflow of ḡ must stay with its sample.
-  if (!waits_for_report(o) && gpu::may_run_kernel(cotangent, o.solver) && !in_torch_func()) {
+  const bool has_numbers = !at::isTensorSubclassLike(lambda) && !at::isTensorSubclassLike(u);  // to look at
+  if (has_numbers && !waits_for_report(o) && gpu::may_run_kernel(cotangent, o.solver) && !in_torch_func()) {
     auto kept_u = u;
     leave_out_overflow_on_device(lambda, kept_u, found.info.status);
     if (needed[0]) found.gradients[0] = lambda;
     if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
     products = products_of(*make_operator(a), lambda, kept_u);
-  } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
+  } else if (!has_numbers) {
     const bool may_be_refused = o.on_failure != OnFailure::kRaise;
     const auto healthy = may_be_refused ? with_ones_where_refused(a, found.info.status) : a;
     products = products_of(*make_operator(healthy), lambda, u);

@@ -16,7 +16,8 @@ struct ToleranceSettings {
 ///                  max(floor, 1e-3)
 ///   adjoint_rtol = min(1/10, rtol / adjoint_ratio), but at least adjoint_floor and rtol
 /// Looser adjoint solves give directions in which a descent gets nowhere, hence 1/10. The floor is there because the
-/// cotangent shrinks with the error, and gradients need not become more accurate late. K, and ⌈adjoint_ratio·K⌉ for the adjoint solve, are only limits.
+/// cotangent shrinks with the error, and gradients need not become more accurate late. K, and ⌈adjoint_ratio·K⌉ for the
+/// adjoint solve, are only limits.
 /// Source: the forcing term of inexact Newton methods (Eisenstat and Walker 1996) and of optimisation with
 /// approximate gradients (Pedregosa 2016), applied to training.
 class ToleranceController final : public Controller {

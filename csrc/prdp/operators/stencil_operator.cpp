@@ -4,6 +4,7 @@
 #include <cmath>
 #include <sstream>
 
+#include "prdp/gpu/kernel_text.h"
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/given_stencil.h"
 #include "prdp/kernels/kernel.h"
@@ -179,7 +180,7 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Te
 }
 
 std::optional<gpu::OperatorView> StencilOperator::gpu_view(const at::Tensor& b, bool transposed) const {
-  std::ostringstream type;
+  gpu::KernelText type;
   type << "Stencil<" << gpu::type_of(b.scalar_type()) << ", "
        << gpu::grid_of({grid_.shape + zyx(0), static_cast<size_t>(dim())}) << ", " << b.size(1) << ", " << transposed;
   for (const bool periodic : grid_.periodic) type << ", " << periodic;

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "prdp/solvers/iterate.h"
+#include "prdp/solvers/kept_signs.h"
 #include "prdp/solvers/sample_numbers.h"
 #include "prdp/solvers/sample_system.h"
 #include "prdp/solvers/solve_damped.h"
@@ -170,7 +171,9 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   Scalar componentwise_scale2(const T* x, int64_t attempt) {
     kernels::Workspace<T> memory;
     memory.prepare(2, length(), layout().halo);
-    apply_with_signs(solution(x), [attempt](int64_t i) { return is_negated_in(attempt, i); }, memory);
+    if (const char* kept = attempt == 0 ? first_signs(unknowns()) : nullptr)
+      apply_with_signs(solution(x), [kept](int64_t i) { return kept[i] != 0; }, memory);
+    else apply_with_signs(solution(x), [attempt](int64_t i) { return is_negated_in(attempt, i); }, memory);
     return dot(memory.vector(1), memory.vector(1));
   }
   /// Seldom: as many products, and then as many solves, as there are patterns.

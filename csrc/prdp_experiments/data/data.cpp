@@ -69,7 +69,7 @@ namespace {
 /// validation.
 at::Tensor starts(const Scene& scene, int64_t samples) {
   const auto& d = scene.data;
-  TORCH_CHECK_VALUE(d.file.empty(), "data.file: only the Python trainer reads HDF5 and .npz; run prdp train ",
+  TORCH_CHECK_VALUE(d.file.empty(), "data.file: only prdp train and prdp compare read it, with the states of ",
                     scene.path);
   if (scene.task == Scene::Task::kCorrector) {
     const auto u = random_flow(d.reference_shape, samples, d.seed, scene.physics.lengths);

@@ -46,6 +46,10 @@ class KeyRecorder {
     add(key, "number > " + written(least), written(target), is_optional<T>);
   }
   template <class T>
+  void share(const T& target, const Key& key) {
+    add(key, "number in (0, 1]", written(target), is_optional<T>);
+  }
+  template <class T>
   void whole(const T& target, const Least<int64_t>& least, const Key& key) {
     const auto bound = least.words.empty() ? written(least.value) : least.words;
     add(key, "whole number >= " + bound, written(target), is_optional<T>);

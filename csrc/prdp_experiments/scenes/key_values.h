@@ -30,6 +30,10 @@ class KeyValues {
     write(value, key);
   }
   template <class T>
+  void share(const T& value, const Key& key) {
+    write(value, key);
+  }
+  template <class T>
   void whole(const T& value, const Least<int64_t>&, const Key& key) {
     write(value, key);
   }

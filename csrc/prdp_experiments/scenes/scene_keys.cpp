@@ -248,7 +248,7 @@ void read_prdp(Section& s, Scene& scene) {
              {.name = "growth",
               .means = "a refinement raises K to `growth`·K where that is more than K + `increment`",
               .optional = true});
-  s.above(p.adjoint_ratio, 0.0, {"adjoint_ratio", "the adjoint solve gets ⌈`adjoint_ratio`·K⌉ iterations; at most 1"});
+  s.share(p.adjoint_ratio, {"adjoint_ratio", "the adjoint solve gets ⌈`adjoint_ratio`·K⌉ iterations"});
 }
 
 template <class Section>

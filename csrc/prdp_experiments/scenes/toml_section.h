@@ -127,6 +127,13 @@ class TomlSection {
     if (!(x > least)) fail(key.name, bound(">", least, x));
     target = x;
   }
+  /// In (0, 1].
+  template <class T>
+  void share(T& target, const Key& key) {
+    if (!given<T>(key)) return;
+    above(target, 0.0, key);
+    if (number(key.name) > 1.0) fail(key.name, bound("<=", 1.0, number(key.name)));
+  }
   template <class T>
   void whole(T& target, const Least<int64_t>& least, const Key& key) {
     if (!given<T>(key)) return;

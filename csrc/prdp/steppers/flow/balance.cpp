@@ -1,7 +1,6 @@
 #include "prdp/steppers/flow/balance.h"
 
 #include <algorithm>
-#include <limits>
 
 namespace prdp {
 
@@ -11,9 +10,8 @@ namespace {
 /// and on cells that are long and thin. Measured as the spectral radius of steps of Stokes flow.
 constexpr double kLargestWhole = 4;
 
-/// So does the flow along a periodic axis through a throat one cell wide, whose drag the pressure hands to all the
-/// fluid along the axis: from ν dt Σ 1/dx² over the other axes of 1.7 on in 2D, and 1.5 in 3D, the longer the box the
-/// sooner.
+/// So does a flow around an island through a throat one cell wide, whose drag the pressure hands to all the fluid that
+/// moves as one: from ν dt Σ 1/dx² over the axes across the throat of 1.5 on, the longer the way around the sooner.
 constexpr double kLargestWholeOfThroats = 1.25;
 
 bool is_incremental(const FlowEquation& e) {
@@ -25,14 +23,14 @@ bool is_incremental(const FlowEquation& e) {
 
 double largest_viscosity(const FlowEquation& e) {
   const auto& box = *e.box;
-  double most = std::numeric_limits<double>::infinity();  // ν dt
-  for (int64_t axis = 0; axis < box.dim(); ++axis) {
-    const double square = box.dx(axis) * box.dx(axis);
-    most = std::min(most, kLargestWhole * square);
-    if (box.obstacle().defined() && box.boundary(axis) == FlowBoundary::kPeriodic)
-      most = std::min(most, kLargestWholeOfThroats / (box.sum_of_couplings() / 2 - 1 / square));
+  double least = box.dx(0), largest = least;
+  for (int64_t axis = 1; axis < box.dim(); ++axis) {
+    least = std::min(least, box.dx(axis));
+    largest = std::max(largest, box.dx(axis));
   }
-  return most / e.dt;
+  // Across the throat are all axes but one, at worst the one with the largest dx.
+  const double across = box.sum_of_couplings() / 2 - 1 / (largest * largest);
+  return (box.obstacle().defined() ? kLargestWholeOfThroats / across : kLargestWhole * least * least) / e.dt;
 }
 
 Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {

@@ -52,6 +52,7 @@ FlowBox::FlowBox(std::vector<int64_t> shape, const std::vector<FlowBoundary>& bo
     TORCH_CHECK_VALUE(obstacle_.sizes() == at::IntArrayRef(shape_), "Flow: obstacle must have the shape of the grid, ",
                       at::IntArrayRef(shape_), ", got ", obstacle_.sizes());
     obstacle_ = obstacle_.detach().to(at::kCPU, /*non_blocking=*/false, /*copy=*/true).contiguous();
+    if (!obstacle_.any().item<bool>()) obstacle_ = at::Tensor();
   }
   fields_ = make_flow_fields(*this);
 }
@@ -63,8 +64,7 @@ int64_t FlowBox::open_axis() const {
 
 bool FlowBox::is_held() const {
   const auto holds = [](FlowBoundary boundary) { return boundary != FlowBoundary::kPeriodic; };
-  return (obstacle_.defined() && obstacle_.any().item<bool>()) ||
-         std::any_of(boundary_.begin(), boundary_.end(), holds);
+  return obstacle_.defined() || std::any_of(boundary_.begin(), boundary_.end(), holds);
 }
 
 double FlowBox::sum_of_couplings() const {
