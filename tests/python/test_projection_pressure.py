@@ -49,7 +49,7 @@ def cavity(dt, n=8, nu=0.2, **options):
                      **options)  # fmt: skip
 
 
-@pytest.mark.parametrize("per_cell", [1.0, 3.9])
+@pytest.mark.parametrize("per_cell", [1.0, 1.2])  # 1.25 is the bound with an obstacle
 def test_steady_flows_do_not_depend_on_the_time_step(per_cell):
     u = torch.zeros(1, 2, 8, 8, dtype=torch.float64)
     expected = steady(cavity(0.01, diffusion="explicit"), u)
@@ -62,7 +62,7 @@ def test_a_force_that_the_pressure_balances_moves_nothing():
     """In a closed box with an obstacle, from rest: a gradient as the force."""
     x = torch.linspace(0, 1, 9, dtype=torch.float64)[:-1]
     force = torch.stack([torch.cos(3 * x).expand(8, 8), (x**2)[:, None].expand(8, 8)])[None]
-    flow = cavity(0.2, force=force)
+    flow = cavity(0.09, force=force)
     flow.wall_velocity = None
     assert flow.rollout(torch.zeros(1, 2, 8, 8, dtype=torch.float64), 3).abs().max() < 1e-11
 
