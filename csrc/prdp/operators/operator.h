@@ -59,7 +59,8 @@ class Operator {
   virtual std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const = 0;
   /// A⁻¹ b, or A⁻ᵀ b, by the cheapest exact method; differentiable.
   virtual at::Tensor solve_directly(const at::Tensor& b, bool transposed) const = 0;
-  /// ‖A‖∞, or a little more: one value, or one per sample. 0 where it is not known, as of a Function; not finite where A is not.
+  /// ‖A‖∞, or a little more: one value, or one per sample. 0 where it is not known, as of a Function; not finite where
+  /// A is not.
   virtual at::Tensor norm() const = 0;
   /// ‖Aᵀ‖∞ in the same way.
   virtual at::Tensor norm_of_transpose() const { return norm(); }  // of a symmetric A, or where it is not known
