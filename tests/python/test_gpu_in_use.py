@@ -44,6 +44,18 @@ def test_in_a_compiled_program(start):
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.parametrize("on_failure", ["return", "zero_grad"])
+def test_in_a_compiled_program_that_does_not_wait_for_a_report(on_failure):
+    """The backward pass is traced where a kernel would run, and has no numbers there."""
+    step = prdp.Burgers((16,), 1e-2, 1e-2, solver=prdp.GMRES(4, restart=3), on_failure=on_failure)
+    u = noise(2, 1, 16).requires_grad_()
+    expected = torch.autograd.grad(step(u).square().sum(), u)[0]
+    with Fibers():
+        compiled = torch.compile(lambda u: step(u).square().sum(), backend="aot_eager", fullgraph=True)
+        found = torch.autograd.grad(compiled(u), u)[0]
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
+
+
 @pytest.mark.parametrize("start", ["zero", "state"])
 @pytest.mark.parametrize(("method", "rtol"), [(prdp.Jacobi, 0.0), (prdp.Chebyshev, 0.0), (prdp.Jacobi, 3e-2)])
 def test_unrolled_sweeps_go_back_in_a_kernel(method, rtol, start):
