@@ -85,11 +85,17 @@ class Row:
         return self.stack("iterations") / np.where(solves > 0, solves, np.nan)
 
     def warnings(self) -> list[str]:
-        """What the controllers said in the end, of every seed that has something to say."""
-        return [c["warning"] for c in self.curves if "warning" in c]
+        """What the controllers said in the end, else that solves still failed, of every seed with something to say."""
+        said = [c.get("warning") or _still_failing(c) for c in self.curves]
+        return [words for words in said if words]
 
     def reaches(self, target: float) -> np.ndarray:
         return np.asarray((self.stack("metric") <= target).any(1))
+
+
+def _still_failing(curves: Curves) -> str | None:
+    failed = curves["failed"][-1] if curves.get("failed") else 0
+    return f"solves of {failed:,} samples failed in the last interval" if failed else None
 
 
 def why_lost(curves: Curves) -> str | None:

@@ -55,6 +55,12 @@ def test_a_constant_k_that_is_given_twice_is_trained_once(tmp_path):
     assert [row.label for row in compare.rows_of(scene)].count("constant_2") == 1
 
 
+def test_a_row_whose_solves_still_fail_in_the_end_warns():
+    row = compare.Row("converged", "converged", "converged", DEFAULTS)
+    row.curves += [{"failed": [6, 0]}, {"failed": [0, 1206]}, {"failed": [2], "warning": "the error grows"}]
+    assert row.warnings() == ["solves of 1,206 samples failed in the last interval", "the error grows"]
+
+
 def test_a_fall_in_the_metric_is_no_proof():
     """PRDP's defaults stop at K = 18 where the unknowns make up for the solver's error: the misfit is small."""
     scene = scenes.load("poisson_3p")
