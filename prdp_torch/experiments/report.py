@@ -32,7 +32,7 @@ def columns(scene: _C.Scene) -> list[Column]:
     if target is not None:
         reached.append(Column(unit, unit + until, f"{unit}:{until}; a run that misses it counts in full."))
     return [
-        Column("", "", "Converged: K_ε, the K of the scene's converged solver. !: the controller warns, or solves fail to the end."),
+        Column("", "", "Converged: K_ε, the converged solver's K. !: the controller warns, or solves fail to the end."),
         Column(
             "error", f"final {error}", "" if scene.task == "parameters" else "± one standard deviation over the seeds."
         ),
