@@ -69,7 +69,6 @@ py::object call_linear_solve(const py::object& b, const std::vector<py::object>&
   if (is_watched && is_function(a) && in_vmap()) refuse_mapped_captures(a, rhs);  // as linear_solve() does
   if (is_watched) return py::none();
   return without_lock([&, start = x0 ? THPVariable_Unpack(x0->ptr()) : at::Tensor()] {
-    check_memory(options, rhs);
     return linear_solve(a, rhs, with(options, max_iter, adjoint_log), start);
   });
   END_HANDLE_TH_ERRORS_PYBIND

@@ -53,7 +53,7 @@ def columns(scene: _C.Scene) -> list[Column]:
             "saved",
             "products saved",
             "saved: share of the converged run's products, given only if the error is at most one standard deviation, "
-            "or a tenth, above that of the converged run and the controller does not warn.",
+            "or a tenth, above that of the converged run and it does not warn.",
         ),
         Column("s", "seconds of training (median)"),
     ]
@@ -140,13 +140,13 @@ def _verdict(scene: _C.Scene, base: Entry, entry: Entry) -> str:
         if not base["reaches_target"]:
             return f"{name} {ending}; {against} does not."
         if entry["warning"]:
-            return f"{name} {ending}, {against} after {base['intervals']:.0f}; its controller warns."
+            return f"{name} {ending}, {against} after {base['intervals']:.0f}; it warns."
         return f"{name} {ending}, {against} after {base['intervals']:.0f}, {_savings(base, entry)}."
     spread = f" ± {base['metric_std']:.1e}" if base["metric_std"] else ""
     ending = f"{name} ends at an error of {entry['metric']:.2e}, {against} at {base['metric']:.2e}{spread}"
     if not entry["as_good"]:
         return f"{ending}: it fails."
-    return f"{ending}; its controller warns." if entry["warning"] else f"{ending}: {_savings(base, entry)}."
+    return f"{ending}; it warns." if entry["warning"] else f"{ending}: {_savings(base, entry)}."
 
 
 def _savings(base: Entry, entry: Entry) -> str:

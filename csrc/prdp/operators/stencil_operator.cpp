@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <sstream>
 
 #include "prdp/gpu/kernel_text.h"
 #include "prdp/gpu/operator_view.h"

@@ -23,14 +23,14 @@ bool is_incremental(const FlowEquation& e) {
 
 double largest_viscosity(const FlowEquation& e) {
   const auto& box = *e.box;
-  double least = box.dx(0), largest = least;
-  for (int64_t axis = 1; axis < box.dim(); ++axis) {
-    least = std::min(least, box.dx(axis));
-    largest = std::max(largest, box.dx(axis));
+  if (box.obstacle().defined()) {
+    // Across the throat are all axes but one, at worst the one with the largest dx.
+    const double dx = box.largest_dx(), across = box.sum_of_couplings() / 2 - 1 / (dx * dx);
+    return kLargestWholeOfThroats / across / e.dt;
   }
-  // Across the throat are all axes but one, at worst the one with the largest dx.
-  const double across = box.sum_of_couplings() / 2 - 1 / (largest * largest);
-  return (box.obstacle().defined() ? kLargestWholeOfThroats / across : kLargestWhole * least * least) / e.dt;
+  double least = box.dx(0);
+  for (int64_t axis = 1; axis < box.dim(); ++axis) least = std::min(least, box.dx(axis));
+  return kLargestWhole * least * least / e.dt;
 }
 
 Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {

@@ -67,6 +67,12 @@ bool FlowBox::is_held() const {
   return obstacle_.defined() || std::any_of(boundary_.begin(), boundary_.end(), holds);
 }
 
+double FlowBox::largest_dx() const {
+  double largest = dx(0);
+  for (int64_t axis = 1; axis < dim(); ++axis) largest = std::max(largest, dx(axis));
+  return largest;
+}
+
 double FlowBox::sum_of_couplings() const {
   double sum = 0;
   for (int64_t axis = 0; axis < dim(); ++axis) sum += 2.0 / (dx(axis) * dx(axis));

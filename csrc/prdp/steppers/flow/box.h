@@ -58,6 +58,7 @@ class FlowBox {
   int64_t channel_of(int64_t axis) const { return dim() - 1 - axis; }
   /// Whether walls, obstacles or an inflow hold the mean velocity.
   bool is_held() const;
+  double largest_dx() const;
   /// Σ_axes 2 / dx².
   double sum_of_couplings() const;
 

@@ -39,8 +39,7 @@ std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i
 gpu::CourantLimit courant_limit(const FlowEquation& e) {
   const bool is_upwind = e.advection == FlowAdvection::kUpwind;
   if (!e.is_diffused_implicitly()) return {.taken_per_nu = is_upwind ? e.dt * e.box->sum_of_couplings() : 0.0};
-  double dx = 0;
-  for (int64_t axis = 0; axis < e.box->dim(); ++axis) dx = std::max(dx, e.box->dx(axis));
+  const double dx = e.box->largest_dx();
   return {.free_per_nu = is_upwind ? 0.0 : 2 * e.dt / (dx * dx)};
 }
 
