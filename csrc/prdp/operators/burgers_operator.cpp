@@ -5,6 +5,7 @@
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/upwind_kernels.h"
 #include "prdp/operators/upwind_rule_kernel.h"
+#include "prdp/operators/upwind_rule_loops.h"
 
 namespace prdp {
 
@@ -25,8 +26,9 @@ const AdvectionDiffusion& BurgersOperator::block() const {
 }
 
 std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (auto found = burgers_rule_by_kernel(grid_, winds_, step_.dt, lambda, u))
-    return {found->winds, found->nu.to(step_.nu.options())};
+  auto found = burgers_rule_by_kernel(grid_, winds_, step_.dt, lambda, u);
+  if (!found) found = burgers_rule_on_loops(grid_, winds_, step_.dt, lambda, u);
+  if (found) return {found->winds, found->nu.to(step_.nu.options())};
   const auto [faces, nu] = block().product_rule(lambda, u);
   std::vector<at::Tensor> channels;
   for (int64_t d = grid_.dim() - 1; d >= 0; --d)  // the means, transposed

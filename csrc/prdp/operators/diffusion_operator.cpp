@@ -120,30 +120,39 @@ DiffusionOperator::SideProducts DiffusionOperator::side_product_rule(int64_t axi
   return {2.0 * product * of_within, h_bar.dim() == 0 ? h_bar : h_bar.squeeze(d).squeeze(1)};
 }
 
+void DiffusionOperator::add_rule_of_faces(int64_t axis, const at::Tensor& lambda, const at::Tensor& u,
+                                          at::Tensor& kappa_bar) const {
+  const int64_t d = 2 + axis;
+  const auto kappa = kappa_along(axis);
+  // Fields that are zero but at the low, or the high end of the axis.
+  const auto at_first = [&](const at::Tensor& t) { return padded(t, d, 0, shape_[axis] - t.size(d)); };
+  const auto at_last = [&](const at::Tensor& t) { return padded(t, d, shape_[axis] - t.size(d), 0); };
+  const auto inner =
+      inverse_width2(axis) * over_channels(above(u, d) - below(u, d), above(lambda, d) - below(lambda, d));
+  add_to(kappa_bar, at_last(inner * derivative_of_mean(box_.mean, above(kappa, d), below(kappa, d))));
+  add_to(kappa_bar, at_first(inner * derivative_of_mean(box_.mean, below(kappa, d), above(kappa, d))));
+  if (!wraps_around(axis)) return;
+  const auto around =
+      inverse_width2(axis) * over_channels(first(u, d) - last(u, d), first(lambda, d) - last(lambda, d));
+  add_to(kappa_bar, at_first(around * derivative_of_mean(box_.mean, first(kappa, d), last(kappa, d))));
+  add_to(kappa_bar, at_last(around * derivative_of_mean(box_.mean, last(kappa, d), first(kappa, d))));
+}
+
 std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   if (auto by_kernel = product_rule_by_kernel(lambda, u); !by_kernel.empty()) return by_kernel;
+  const bool on_loops = has_rule_on_loops(lambda, u);
   const auto shift_bar = like(shift_, over_channels(lambda, u));
   std::vector<at::Tensor> kappa_bars(per_axis_ ? dim() : 1), robin_bar;
   for (int64_t axis = 0; axis < dim(); ++axis) {
-    const int64_t d = 2 + axis;
     auto& kappa_bar = kappa_bars[per_axis_ ? axis : 0];
-    const auto kappa = kappa_along(axis);
-    // Fields that are zero but at the low, or the high end of the axis.
-    const auto at_first = [&](const at::Tensor& t) { return padded(t, d, 0, shape_[axis] - t.size(d)); };
-    const auto at_last = [&](const at::Tensor& t) { return padded(t, d, shape_[axis] - t.size(d), 0); };
-    const auto inner =
-        inverse_width2(axis) * over_channels(above(u, d) - below(u, d), above(lambda, d) - below(lambda, d));
-    add_to(kappa_bar, at_last(inner * derivative_of_mean(box_.mean, above(kappa, d), below(kappa, d))));
-    add_to(kappa_bar, at_first(inner * derivative_of_mean(box_.mean, below(kappa, d), above(kappa, d))));
-    if (wraps_around(axis)) {
-      const auto around =
-          inverse_width2(axis) * over_channels(first(u, d) - last(u, d), first(lambda, d) - last(lambda, d));
-      add_to(kappa_bar, at_first(around * derivative_of_mean(box_.mean, first(kappa, d), last(kappa, d))));
-      add_to(kappa_bar, at_last(around * derivative_of_mean(box_.mean, last(kappa, d), first(kappa, d))));
-    }
+    if (on_loops) add_rule_on_loops(axis, lambda, u, kappa_bar);
+    else add_rule_of_faces(axis, lambda, u, kappa_bar);
     for (size_t end = 0; end < 2; ++end) {
+      if (on_loops && box_.sides[axis][end] != Side::kRobin) continue;  // done
       const auto [of_kappa, of_h] = side_product_rule(axis, end, lambda, u);
-      if (of_kappa.defined()) add_to(kappa_bar, end == 0 ? at_first(of_kappa) : at_last(of_kappa));
+      const int64_t elsewhere = shape_[axis] - 1;
+      if (of_kappa.defined())
+        add_to(kappa_bar, padded(of_kappa, 2 + axis, end == 0 ? 0 : elsewhere, end == 0 ? elsewhere : 0));
       if (of_h.defined()) robin_bar.push_back(of_h);
     }
   }

@@ -88,6 +88,13 @@ class DiffusionOperator final : public Operator {
     at::Tensor of_kappa, of_h;
   };
   SideProducts side_product_rule(int64_t axis, size_t end, const at::Tensor& lambda, const at::Tensor& u) const;
+  /// ∂⟨λ, A u⟩/∂κ along an axis, without its sides, added to what is there.
+  void add_rule_of_faces(int64_t axis, const at::Tensor& lambda, const at::Tensor& u, at::Tensor& kappa_bar) const;
+  /// The same by loops on the CPU, with the sides but for Robin's, for the tensors that the first function says.
+  bool has_rule_on_loops(const at::Tensor& lambda, const at::Tensor& u) const;
+  void add_rule_on_loops(int64_t axis, const at::Tensor& lambda, const at::Tensor& u, at::Tensor& kappa_bar) const;
+  template <class T>
+  void add_rule_of_axis(int64_t axis, const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& kappa_bar) const;
   /// The product rule in one launch on a GPU; nothing where there is no kernel.
   std::vector<at::Tensor> product_rule_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const;
   template <class T>

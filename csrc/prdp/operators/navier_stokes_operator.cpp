@@ -6,6 +6,7 @@
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/upwind_kernels.h"
 #include "prdp/operators/upwind_rule_kernel.h"
+#include "prdp/operators/upwind_rule_loops.h"
 
 namespace prdp {
 
@@ -92,8 +93,9 @@ at::Tensor NavierStokesOperator::norm_of(const at::Tensor& of_c1, const at::Tens
 }
 
 std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (auto found = navier_stokes_rule_by_kernel(grid_, winds_, lambda, u))
-    return {found->winds, found->nu.to(step_.nu.options())};
+  auto found = navier_stokes_rule_by_kernel(grid_, winds_, lambda, u);
+  if (!found) found = navier_stokes_rule_on_loops(grid_, winds_, lambda, u);
+  if (found) return {found->winds, found->nu.to(step_.nu.options())};
   const auto& [c1, c2] = momentum();
   const auto g1 = c1.product_rule(part(lambda, 0), part(u, 0));
   const auto g2 = c2.product_rule(part(lambda, 1), part(u, 1));
