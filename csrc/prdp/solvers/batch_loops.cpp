@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "prdp/kernels/whole_vectors.h"
+#include "prdp/solvers/any_length.h"
 #include "prdp/solvers/sample_numbers.h"
 #include "prdp/threads/share_samples.h"
 
@@ -69,17 +69,14 @@ Scalar of_each_number(const OfSample& of_sample, const Scalar& first, const Numb
 
 }  // namespace
 
-bool take(const at::Tensor& b) {
-  if (!b.is_cpu() || !b.is_contiguous() || b.numel() == 0) return false;
-  return unknowns(b) % (b.scalar_type() == at::kFloat ? kernels::kLanes<float> : kernels::kLanes<double>) == 0;
-}
+bool take(const at::Tensor& b) { return b.is_cpu() && b.is_contiguous() && b.numel() > 0; }
 
 at::Tensor dot(const Vector& a, const Vector& b) {
   auto found = numbers_like(a);
   with_type(a, [&]<class T>(T) {
     const T *left = data<T>(a), *right = data<T>(b);
     T* to = found.mutable_data_ptr<T>();
-    const kernels::WholeVectors<T> loops;
+    const AnyLength<T> loops;
     for_each_sample(a, [&](int64_t s, int64_t at) { to[s] = loops.dot(left + at, right + at, unknowns(a)); });
   });
   return found;
@@ -90,7 +87,7 @@ at::Tensor largest_magnitude(const Vector& v) {
   with_type(v, [&]<class T>(T) {
     const T* from = data<T>(v);
     T* to = found.mutable_data_ptr<T>();
-    const kernels::WholeVectors<T> loops;
+    const AnyLength<T> loops;
     for_each_sample(v, [&](int64_t s, int64_t at) { to[s] = loops.largest_magnitude(from + at, unknowns(v)); });
   });
   return found;
@@ -100,7 +97,7 @@ void scale(const Scalar& factor, const Vector& v, Vector& out) {
   with_type(v, [&]<class T>(T) {
     T* to = own<T>(out);
     const T *from = data<T>(v), *times = numbers<T>(factor, v);
-    const kernels::WholeVectors<T> loops;
+    const AnyLength<T> loops;
     for_each_sample(v, [&](int64_t s, int64_t at) { loops.scale(times[s], from + at, to + at, unknowns(v)); });
   });
 }
@@ -110,7 +107,7 @@ std::array<Scalar, 2> scale_with_dots(const Scalar& factor, const Vector& v, con
   with_type(v, [&]<class T>(T) {
     T *to = own<T>(out), *along = found[0].mutable_data_ptr<T>(), *square = found[1].mutable_data_ptr<T>();
     const T *from = data<T>(v), *with = data<T>(w), *times = numbers<T>(factor, v);
-    const kernels::WholeVectors<T> loops;
+    const AnyLength<T> loops;
     for_each_sample(v, [&](int64_t s, int64_t at) {
       const auto dots = loops.scale_with_dots(times[s], from + at, with + at, to + at, unknowns(v));
       along[s] = dots[0];
@@ -124,7 +121,7 @@ void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active) 
   with_type(y, [&]<class T>(T) {
     T* to = own<T>(y);
     const T *from = data<T>(x), *factor = numbers<T>(beta, y);
-    const kernels::WholeVectors<T> loops;
+    const AnyLength<T> loops;
     for_each_sample(y, [&](int64_t s, int64_t at) {
       if (goes_on(active, s)) loops.xpby(from + at, factor[s], to + at, unknowns(y));
     });
@@ -137,7 +134,7 @@ at::Tensor update_iterate_and_residual(const Scalar& alpha, const Vector& p, con
   with_type(r, [&]<class T>(T) {
     T *to_x = own<T>(x), *to_r = own<T>(r), *square = rr.mutable_data_ptr<T>();
     const T *along = data<T>(p), *taken = data<T>(q), *factor = numbers<T>(alpha, r);
-    const kernels::WholeVectors<T> loops;
+    const AnyLength<T> loops;
     for_each_sample(r, [&](int64_t s, int64_t at) {
       const int64_t n = unknowns(r);
       square[s] = goes_on(active, s)
@@ -156,7 +153,7 @@ void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, con
       std::vector<const T*> vectors(count);
       std::vector<T> found(count);
       for (int64_t i = 0; i < count; ++i) vectors[i] = data<T>(v[i]) + at;
-      kernels::WholeVectors<T>().multi_dot(vectors.data(), count, times[s], from + at, found.data(), unknowns(w));
+      AnyLength<T>().multi_dot(vectors.data(), count, times[s], from + at, found.data(), unknowns(w));
       for (int64_t i = 0; i < count; ++i) h[i].template mutable_data_ptr<T>()[s] = found[i];
     });
   });
@@ -172,9 +169,8 @@ at::Tensor combine(double sign, const Scalar* h, const std::vector<Vector>& v, i
       std::vector<const T*> vectors(count);
       std::vector<T> weights(count);
       for (int64_t i = 0; i < count; ++i) vectors[i] = data<T>(v[i]) + at, weights[i] = numbers<T>(h[i], w)[s];
-      squares[s] =
-          kernels::WholeVectors<T>().multi_axpy(static_cast<T>(sign), weights.data(), vectors.data(), count,
-                                                factor ? numbers<T>(*factor, w)[s] : T(1), to + at, unknowns(w));
+      squares[s] = AnyLength<T>().multi_axpy(static_cast<T>(sign), weights.data(), vectors.data(), count,
+                                             factor ? numbers<T>(*factor, w)[s] : T(1), to + at, unknowns(w));
     });
   });
   return square;

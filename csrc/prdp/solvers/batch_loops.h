@@ -16,7 +16,7 @@ using Vector = at::Tensor;
 using Scalar = at::Tensor;
 using Active = std::vector<bool>;
 
-/// Whether they can take vectors like b. The loops work on whole registers.
+/// Whether they can take vectors like b.
 bool take(const at::Tensor& b);
 
 Scalar dot(const Vector& a, const Vector& b);
