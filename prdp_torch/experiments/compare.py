@@ -174,7 +174,7 @@ def run_one(
     callbacks: Iterable[Callback] = (),
     on_data: OnData | None = None,
 ) -> Curves:
-    """One training with its record, and beside it the final weights of a network, `seed_N.pt`; if `resume`,
+    """One training with its record, and beside it the final weights, of a network or θ, `seed_N.pt`; if `resume`,
     the curves of a finished record of the same settings, or the training goes on from its checkpoint. ValueError for
     a record of the same settings and another number of intervals, which would be lost."""
     path, checkpoint = _files_of(scene, label, seed, folder, environment)
@@ -186,7 +186,7 @@ def run_one(
     curves = data_parallel.from_first(lambda: _finished(path, scene, checkpoint)) if resume else None
     if curves is not None:
         return curves
-    network = make_network(scene, seed) if scene.trains_network else None
+    network = make_network(scene, seed)
     curves = train(scene, refinement, seed, network, callbacks, on_data, checkpoint)
     record = {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves}
     if scene.network.python:

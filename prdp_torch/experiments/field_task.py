@@ -11,6 +11,7 @@ from torch import Tensor
 from prdp_torch import operators
 from prdp_torch.experiments import _C
 from prdp_torch.experiments.checkpoint import load_optimiser, make_optimiser, state_of
+from prdp_torch.experiments.networks import Theta
 from prdp_torch.experiments.task import Task
 from prdp_torch.implicit_step import ImplicitStep
 from prdp_torch.solve import detach_failed
@@ -109,11 +110,11 @@ def misfit(scene: _C.Scene, stepper: ImplicitStep, problem: _C.FieldProblem, the
     return _C.normalised_mse(_C.observed(states, scene), problem.snapshots)
 
 
-def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int) -> Task:
+def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, found: Theta) -> Task:
     """An interval is a single update, the metric the relative error of κ. A user knows the relative misfit alone."""
     (stepper,) = cast(list[ImplicitStep], steppers)
     problem = _C.make_field_problem(scene, seed)
-    theta = problem.theta.clone().requires_grad_()
+    theta = found.begin(problem.theta)
     optimiser = make_optimiser(scene, [theta])
     relative = 1.0  # before the first solve nothing is explained yet
 

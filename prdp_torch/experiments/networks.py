@@ -126,6 +126,21 @@ class UNet(torch.nn.Module):
         return projected
 
 
+class Theta(torch.nn.Module):
+    """θ, which a task without a network finds: κ = exp(θ) of a field, (*shape), or the load of a Poisson problem, a
+    number for each of its modes. `train` gives it its start, and leaves in it what it has found."""
+
+    def __init__(self, scene: _C.Scene) -> None:
+        super().__init__()
+        shape = scene.physics.shape if scene.task == "field" else _C.make_parameter_problem(scene).start.shape
+        self.theta = torch.nn.Parameter(torch.zeros(shape, dtype=scene.dtype))
+
+    def begin(self, start: Tensor) -> torch.nn.Parameter:
+        """θ as a training begins with it, where it takes place."""
+        self.theta = torch.nn.Parameter(start.clone())
+        return self.theta
+
+
 _KINDS: dict[str, Callable[[_C.Physics, _C.Network], torch.nn.Module]] = {
     "mlp": lambda physics, network: MLP(physics.channels * math.prod(physics.shape), network.hidden),
     "resnet": lambda physics, network: ResNet(
@@ -138,9 +153,11 @@ _KINDS: dict[str, Callable[[_C.Physics, _C.Network], torch.nn.Module]] = {
 
 
 def make_network(scene: _C.Scene, seed: int, without_memory: bool = False) -> torch.nn.Module:
-    """Make the network of a scene. The same seed gives the same weights in Python and in C++. `without_memory` makes
-    it on the device "meta", for weights that are loaded into it; a class of the user's own is made as it is. ValueError
-    for one whose training this machine cannot hold."""
+    """Make the network of a scene, or the `Theta` of a task without one. The same seed gives the same weights in Python
+    and in C++. `without_memory` makes it on the device "meta", for weights that are loaded into it; a class of the
+    user's own is made as it is. ValueError for one whose training this machine cannot hold."""
+    if not scene.trains_network:
+        return Theta(scene)
     if scene.network.python:
         return own_networks.make(scene, seed)
     if not without_memory:

@@ -6,15 +6,16 @@ import torch
 from torch import Tensor
 
 from prdp_torch.experiments import _C
+from prdp_torch.experiments.networks import Theta
 from prdp_torch.experiments.task import Task
 from prdp_torch.stepper import Stepper
 
 
-def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int) -> Task:
+def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, found: Theta) -> Task:
     """An interval is a single update, the metric the error of θ."""
     (stepper,) = steppers
     problem = _C.make_parameter_problem(scene)
-    theta = problem.start.clone().requires_grad_()
+    theta = found.begin(problem.start)
     # What a user sees, who does not know θ; before the first solve nothing is explained yet.
     misfit = 1.0
 

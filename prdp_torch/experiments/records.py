@@ -108,7 +108,7 @@ def write(path: Path, content: str | dict[str, Any]) -> None:
 
 
 def write_training(path: Path, record: dict[str, Any], network: torch.nn.Module | None = None) -> None:
-    """Write the record of a training, and the `state_dict` of its network (if it has one) beside it, on the CPU: both,
+    """Write the record of a training, and the `state_dict` of what it trained beside it, on the CPU: both,
     each whole, or neither. The record holds the weights' fingerprint. ValueError if they cannot be written; an earlier
     record is then still there, with its weights. Of several processes the first one writes."""
     if not data_parallel.is_first():

@@ -172,10 +172,10 @@ def write(scene: _C.Scene, rows: list[Row], table: list[Entry], shown: Trajector
     `trajectories.gif` for fields in 2D. shown: from `trajectories.collect`, or None."""
     import jinja2  # with matplotlib half a second, which other commands need not wait for
 
-    from prdp_torch.experiments import charts, trajectory_charts
+    from prdp_torch.experiments import charts, found, trajectory_charts
 
     drawn = charts.all_charts(scene, rows, table)
-    learned = trajectory_charts.pictures(scene, shown) if shown else []
+    learned = trajectory_charts.pictures(scene, shown) if shown else found.pictures(scene, rows, folder)
     for name, figure, _ in [*drawn, *learned]:
         charts.write_png(figure, folder / f"{name}.png", dpi=120)
     animation = folder / "trajectories.gif"

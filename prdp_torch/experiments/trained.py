@@ -69,7 +69,10 @@ def load_trained(run_folder: str | Path, seed: int = 0, device: str | torch.devi
     assert record is not None
     scene = placed(records.scene_of(path, record), device)
     if not scene.trains_network:
-        raise ValueError(f"load_trained: the scene '{scene.name}' trains no network; read its record, '{path}'")
+        kept = records.weights_of(path)
+        raise ValueError(
+            f"load_trained: the scene '{scene.name}' trains no network; torch.load('{kept}')['theta'] is what it found"
+        )
     if "diverged" in record["curves"]:
         raise ValueError(f"load_trained: the training of '{path}' diverged, {record['curves']['diverged']}")
     network = records.read_weights(path, make_network(scene, seed, without_memory=True), record)

@@ -16,6 +16,7 @@ from prdp_torch import data_parallel
 from prdp_torch.controller import ToleranceController
 from prdp_torch.experiments import _C, datasets, field_task, network_task, parameter_task
 from prdp_torch.experiments.checkpoint import Checkpoint, Found, check_tensors, load_random, random_states
+from prdp_torch.experiments.networks import Theta
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.reports import any_nonfinite, on_host, spent_on
 from prdp_torch.experiments.scenes import make_stepper, placed
@@ -95,7 +96,9 @@ def train(
         seed: sets the initial weights of the network, the order of the batches and the random numbers of the training,
             such as those of dropout; for the task "field", the noise.
             The data of a scene do not depend on it.
-        network: any module that maps (batch, channels, *shape) to the same shape. None makes that of the scene.
+        network: any module that maps (batch, channels, *shape) to the same shape. None makes that of the scene. For the
+            tasks "field" and "parameters", a `prdp_torch.experiments.networks.Theta(scene)`, in which what is found is
+            left.
         callbacks: functions that are called after each interval with an `Interval`. If one returns True, the
             training stops and its checkpoint is saved. If a training continues from a checkpoint, they are first
             called with the intervals that were done before (`resumed`). A diverged interval makes no call.
@@ -152,7 +155,7 @@ def train(
     for callback in callbacks:
         if not callable(callback):
             raise TypeError(f"train: callbacks must be functions of an Interval, got {callback!r}")
-    if not scene.trains_network and (data is not None or network is not None):
+    if not scene.trains_network and (data is not None or not isinstance(network, Theta | None)):
         raise ValueError(f"train: the task '{scene.task}' trains no network: it takes neither data nor network")
     if checkpoint is not None and isinstance(network, torch.nn.Module):
         check_tensors(network)
@@ -163,7 +166,8 @@ def train(
         data = data_parallel.first_before_others(functools.partial(datasets.of_scene, scene, data, on_data))
         task = network_task.make_task(scene, steppers, seed, network, data)
     else:
-        task = (field_task if scene.task == "field" else parameter_task).make_task(scene, steppers, seed)
+        theta = network if isinstance(network, Theta) else Theta(scene)
+        task = (field_task if scene.task == "field" else parameter_task).make_task(scene, steppers, seed, theta)
     try:
         with _repeatable(scene.device, seed):
             training.run(task, found)

@@ -20,7 +20,7 @@ struct Curves {
   std::vector<double> seconds;
   std::string diverged;  // where and why a training was lost; its curves end there, with a metric of NaN
   std::string warning;   // what the controller says in the end
-  std::string weights;   // of a network in the end, as pack_weights() makes them
+  std::string weights;   // in the end, of a network or θ, as pack_weights() makes them
 };
 
 /// Calls f(name, values) for each of them that has an entry for every interval or update.

@@ -13,6 +13,7 @@ class FieldTraining {
   FieldTraining(const FieldTraining&) = delete;
 
   ImplicitStep& stepper() { return model_.stepper(); }
+  const at::Tensor& theta() const { return theta_; }
   /// Refers to this object.
   Task task();
 

@@ -176,6 +176,13 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   return curves;
 }
 
+/// What a task without a network has found, as weights.
+std::string pack_theta(const at::Tensor& theta) {
+  torch::nn::Module module;
+  module.register_parameter("theta", theta.detach(), /*requires_grad=*/false);
+  return pack_weights(module);
+}
+
 Curves train_parameters(const Scene& scene, Run& run, const SceneStep& stepper, const OnInterval& on_interval) {
   const auto problem = make_parameter_problem(scene);
   auto theta = problem.start.clone().requires_grad_();
@@ -198,7 +205,9 @@ Curves train_parameters(const Scene& scene, Run& run, const SceneStep& stepper, 
   const auto load_theta = [&](Saved& saved, int64_t) {
     theta.detach().copy_(saved.take("theta", theta.scalar_type(), theta.sizes()));
   };
-  return run.go({updates, metric, [&](double) { return misfit; }, save_theta, load_theta}, on_interval);
+  auto curves = run.go({updates, metric, [&](double) { return misfit; }, save_theta, load_theta}, on_interval);
+  curves.weights = pack_theta(theta);
+  return curves;
 }
 
 }  // namespace
@@ -212,7 +221,9 @@ Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, con
   const Solver solver = refinement.direct ? Solver(Direct{}) : scene.solver;
   if (scene.task == Scene::Task::kField) {
     FieldTraining field(scene, solver, seed);
-    return Run(scene, refinement, seed, checkpoint, {&field.stepper()}).go(field.task(), on_interval);
+    auto curves = Run(scene, refinement, seed, checkpoint, {&field.stepper()}).go(field.task(), on_interval);
+    curves.weights = pack_theta(field.theta());
+    return curves;
   }
   Steppers steppers;
   for (int64_t i = 0; i < scene.executions(); ++i) steppers.push_back(scene_step(scene, solver));
