@@ -149,10 +149,15 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
     else add_rule_of_faces(axis, lambda, u, kappa_bar);
     for (size_t end = 0; end < 2; ++end) {
       if (on_loops && box_.sides[axis][end] != Side::kRobin) continue;  // done
-      const auto [of_kappa, of_h] = side_product_rule(axis, end, lambda, u);
+      const auto sides = side_product_rule(axis, end, lambda, u);
+      const auto &of_kappa = sides.of_kappa, &of_h = sides.of_h;
       const int64_t elsewhere = shape_[axis] - 1;
-      if (of_kappa.defined())
-        add_to(kappa_bar, padded(of_kappa, 2 + axis, end == 0 ? 0 : elsewhere, end == 0 ? elsewhere : 0));
+      const auto at_side = [&] {
+        return padded(of_kappa, 2 + axis, end == 0 ? 0 : elsewhere, end == 0 ? elsewhere : 0);
+      };
+      if (of_kappa.defined() && on_loops && kappa_.size(0) == 1)
+        kappa_bar.narrow(0, 0, 1).add_(like(kappa_, at_side()));
+      else if (of_kappa.defined()) add_to(kappa_bar, at_side());
       if (of_h.defined()) robin_bar.push_back(of_h);
     }
   }

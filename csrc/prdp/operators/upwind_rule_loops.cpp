@@ -7,8 +7,8 @@
 
 #include "prdp/gpu/device/upwind_product_rule.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/sets_of_samples.h"
 #include "prdp/operators/sums_in_order.h"
-#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -78,16 +78,23 @@ void laplacian_terms(const Plane<T>& plane, T beta, const T* __restrict l, const
   for (int64_t i = 0; i < plane.points(); ++i) out[i] *= beta * l[i];
 }
 
+/// Samples that share their winds, (samples, channels, points) behind each other.
+template <class T>
+struct Fields {
+  int64_t samples, channels;
+  const T *lambda, *u;
+};
+
 /// Of Burgers' wind along an axis. `memory` holds three fields.
 template <class T>
-void burgers_wind(const Plane<T>& plane, int axis, T beta, int64_t channels, const T* l, const T* v,
-                  const T* __restrict wind, T* __restrict memory, T* __restrict out) {
+void burgers_wind(const Plane<T>& plane, int axis, T beta, const Fields<T>& fields, const T* __restrict wind,
+                  T* __restrict memory, T* __restrict out) {
   const int64_t points = plane.points();
   T* __restrict const face = memory, * __restrict const lower = face + points, * __restrict const upper = lower + points;
   mean_with_next(plane, axis, wind, face);
   std::fill_n(lower, 2 * points, T(0));
-  for (int64_t c = 0; c < channels; ++c)
-    add_differences(plane, axis, beta, l + c * points, v + c * points, lower, upper);
+  for (int64_t k = 0; k < fields.samples * fields.channels; ++k)
+    add_differences(plane, axis, beta, fields.lambda + k * points, fields.u + k * points, lower, upper);
   plane.each(axis, [=](int64_t before, int64_t i, int64_t) {
     lower[i] *= gpu::slope_of_positive(face[before]);
     upper[i] *= gpu::slope_of_negative(face[i]);
@@ -100,13 +107,14 @@ void burgers_wind(const Plane<T>& plane, int axis, T beta, int64_t channels, con
 /// Of the winds of Navier-Stokes, a component each: its own, and what the mean of it over four points carried.
 /// `memory` holds four fields.
 template <class T>
-void navier_stokes_winds(const Plane<T>& plane, const T* l, const T* v, const T* winds, T* __restrict memory, T* out) {
+void navier_stokes_winds(const Plane<T>& plane, const Fields<T>& fields, const T* winds, T* __restrict memory, T* out) {
   const int64_t points = plane.points();
   T *const lower = memory, *const upper = lower + points, *const some = upper + points, *const mean = some + points;
   // ∂/∂(the wind along an axis) at the points of a component, into lower.
   const auto of_wind = [&](int component, int axis, const T* __restrict w) {
     std::fill_n(lower, 2 * points, T(0));
-    add_differences(plane, axis, T(1), l + component * points, v + component * points, lower, upper);
+    for (int64_t k = component; k < fields.samples * fields.channels; k += fields.channels)
+      add_differences(plane, axis, T(1), fields.lambda + k * points, fields.u + k * points, lower, upper);
     for (int64_t i = 0; i < points; ++i)
       lower[i] = gpu::slope_of_positive(w[i]) * lower[i] + gpu::slope_of_negative(w[i]) * upper[i];
   };
@@ -127,34 +135,34 @@ void navier_stokes_winds(const Plane<T>& plane, const T* l, const T* v, const T*
   }
 }
 
-/// `of_sample(plane, λ, u, winds, memory, out)` finds the derivative of a sample's winds. ν acts on `channels`, whose
-/// terms are summed by `sums` channels at a time.
-template <class T, class OfSample>
+/// `of_set(plane, fields, winds, memory, out)` finds the derivative of the winds that samples share. ν acts on
+/// `channels`, whose terms are summed `at_once`.
+template <class T, class OfSet>
 UpwindGradients products(const Grid& grid, const at::Tensor& winds, T beta, int64_t channels, int64_t at_once,
-                         const at::Tensor& lambda, const at::Tensor& u, const OfSample& of_sample) {
+                         const at::Tensor& lambda, const at::Tensor& u, const OfSet& of_set) {
   const auto w = winds.detach().contiguous(), l = lambda.contiguous(), v = u.contiguous();
-  const int64_t batch = l.size(0);
   const Plane<T> plane(grid);
-  const int64_t points = plane.points(), stride = l.size(1) * points, blowing = w.size(1) * points;
+  const int64_t batch = l.size(0), points = plane.points(), stride = l.size(1) * points, blowing = w.size(1) * points;
+  const SetsOfSamples sets(batch, w.size(0));
   auto shape = w.sizes().vec();
-  shape[0] = batch;
+  shape[0] = sets.count;
   const auto out = at::zeros(shape, w.options());  // a pressure blows nowhere
   const auto terms = at::empty({channels / at_once, batch, at_once, points}, w.options());
-  constexpr int64_t worthwhile = 1 << 15;  // numbers for a thread
-  interruption::parallel_for(0, batch, std::max<int64_t>(1, worthwhile / stride), [&](int64_t begin, int64_t end) {
+  sets.share(stride, [&](int64_t set, int64_t first, int64_t samples) {
     std::vector<T> memory(4 * points);
-    for (int64_t s = begin; s < end; ++s) {
-      const T *const my_l = l.const_data_ptr<T>() + s * stride, *const my_v = v.const_data_ptr<T>() + s * stride;
-      of_sample(plane, my_l, my_v, w.const_data_ptr<T>() + (w.size(0) == 1 ? 0 : s) * blowing, memory.data(),
-                out.mutable_data_ptr<T>() + s * blowing);
+    const Fields<T> fields{samples, l.size(1), l.const_data_ptr<T>() + first * stride,
+                           v.const_data_ptr<T>() + first * stride};
+    of_set(plane, fields, w.const_data_ptr<T>() + (w.size(0) == 1 ? 0 : set) * blowing, memory.data(),
+           out.mutable_data_ptr<T>() + set * blowing);
+    for (int64_t s = 0; s < samples; ++s)
       for (int64_t c = 0; c < channels; ++c)
-        laplacian_terms(plane, beta, my_l + c * points, my_v + c * points,
-                        terms.mutable_data_ptr<T>() + ((c / at_once * batch + s) * at_once + c % at_once) * points);
-    }
+        laplacian_terms(
+            plane, beta, fields.lambda + s * stride + c * points, fields.u + s * stride + c * points,
+            terms.mutable_data_ptr<T>() + ((c / at_once * batch + first + s) * at_once + c % at_once) * points);
   });
   auto nu = -total(terms[0]);
   for (int64_t k = 1; k < terms.size(0); ++k) nu = nu - total(terms[k]);
-  return {w.size(0) == 1 ? out.sum(0, /*keepdim=*/true) : out, nu};
+  return {sets.count > w.size(0) ? out.sum(0, /*keepdim=*/true) : out, nu};
 }
 
 bool has_loops(const at::Tensor& winds, const at::Tensor& lambda, const at::Tensor& u) {
@@ -171,10 +179,10 @@ std::optional<UpwindGradients> burgers_rule_on_loops(const Grid& grid, const at:
     using T = scalar_t;
     const int64_t channels = u.size(1);
     return products<T>(grid, winds, static_cast<T>(beta), channels, /*at_once=*/channels, lambda, u,
-                       [&](const auto& plane, const T* l, const T* v, const T* mine, T* memory, T* out) {
+                       [&](const auto& plane, const auto& fields, const T* mine, T* memory, T* out) {
                          for (int axis = 0; axis < grid.dim(); ++axis)
-                           burgers_wind(plane, axis, static_cast<T>(beta), channels, l, v, mine + axis * plane.points(),
-                                        memory, out + axis * plane.points());
+                           burgers_wind(plane, axis, static_cast<T>(beta), fields, mine + axis * plane.points(), memory,
+                                        out + axis * plane.points());
                        });
   });
 }
