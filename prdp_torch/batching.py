@@ -1,7 +1,7 @@
 """The batching rules of the library's ops: what torch.func.vmap makes of a solve.
 
 A mapped axis is folded into the batch, as samples do not influence each other. Where all samples share a
-tensor that is mapped, such as nu, the entries are solved one after the other. Where no tensor of A is mapped,
+tensor that is mapped, such as a matrix, the entries are solved one after the other. Where no tensor of A is mapped,
 each sample has an A of its own, and there are no more samples than entries, one sample is solved after the other: what
 is made of an A, such as its factors, serves all its right-hand sides.
 """
@@ -59,9 +59,10 @@ def _linear_solve(
             of_one = [t[s : s + 1] if is_own else t for t, is_own in zip(tensors, own, strict=True)]
             found.append(solved(of_b[:, s], of_one, None if of_x0 is None else of_x0[:, s], inverse))
         return [torch.stack(parts, 1) for parts in zip(*found, strict=True)], [0] * len(found[0])
-    folded = _fold(tensors, dims_of_tensors, kind, len(shape), size, samples)
+    folded = _fold(tensors, dims_of_tensors, kind, len(shape), size, samples, b)
     # A preconditioner, whose kind is the last of the names and whose shape is behind the counts.
-    folded_inverse = _fold(inverse, dims_of_inverse, names[-1], len(counts) - _COUNTS, size, samples) if inverse else []
+    axes = len(counts) - _COUNTS
+    folded_inverse = _fold(inverse, dims_of_inverse, names[-1], axes, size, samples, b) if inverse else []
     if folded is None or folded_inverse is None:
         arguments = b, tensors, kind, shape, parameters, transposed, x0, names, counts, numbers, inverse
         return _one_by_one(op, info, in_dims, arguments)
@@ -76,9 +77,9 @@ def _of_samples(tensors: list[Tensor], kind: str, axes: int, batch: int) -> list
 
 
 def _fold(
-    tensors: list[Tensor], in_dims: Sequence[int | None], kind: str, axes: int, size: int, batch: int
+    tensors: list[Tensor], in_dims: Sequence[int | None], kind: str, axes: int, size: int, batch: int, like: Tensor
 ) -> list[Tensor] | None:
-    """The tensors of an operator on `size` · `batch` samples; None where there is no such operator."""
+    """The tensors of an operator on `size` · `batch` samples like `like`; None where there is no such operator."""
     tensors = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims, strict=True)]
     mapped = [dim is not None for dim in in_dims]
     dims = _C.batched_axes(kind, axes, len(tensors))
@@ -86,11 +87,13 @@ def _fold(
         return None if tensors else []
     folded = []
     for t, is_mapped, n in zip(tensors, mapped, dims, strict=True):
-        if batch == 1 and any(mapped) and n == t.dim() - is_mapped + 1:
+        if batch == 1 and any(mapped) and n == t.dim() - is_mapped + 1 and n > 1:
             t = t.unsqueeze(int(is_mapped))  # has no batch axis: it is that of the only sample
         of_samples = t.dim() - is_mapped == n and n > 0
         if is_mapped:
-            if not of_samples or t.shape[1] != batch:
+            if n == 1 and t.dim() == 1:  # nu
+                t, of_samples = t[:, None].expand(size, batch), True
+            if not of_samples or t.shape[1] != batch or (n == 1 and t.dtype != like.dtype):
                 return None
             folded.append(t.flatten(0, 1))
         elif of_samples and t.shape[0] == batch:

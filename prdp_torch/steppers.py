@@ -261,8 +261,8 @@ class Heat(TimeStepper):
 
     Args:
         shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
-        nu: diffusivity >= 0, length²/time. A 0-dimensional tensor gets a gradient. A Parameter becomes one of
-            the module, and another tensor a buffer.
+        nu: diffusivity >= 0, length²/time. A tensor gets a gradient: 0-dimensional, or (batch,), one for each sample,
+            in the dtype of the states. A Parameter becomes one of the module, and another tensor a buffer.
         dt: time step > 0. The larger nu dt/dx² is, the more iterations a solve takes.
         solver, backward and the other options: as in `Stepper`.
         length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).

@@ -30,7 +30,8 @@ class Heat(Operator):
 
     Args:
         shape, length: as in `Poisson`.
-        nu: diffusivity >= 0, length²/time; a number or a 0-dimensional tensor, which gets a gradient.
+        nu: diffusivity >= 0, length²/time; a number or a tensor, which gets a gradient: 0-dimensional, or (batch,),
+            one for each sample, in the dtype of the vectors.
         dt: time step > 0.
     """
 

@@ -165,10 +165,13 @@ std::optional<GridOperator<T>> Laplacian<T, Dim>::grid_operator() const {
   return GridOperator<T>{make, key.key(), false};
 }
 
-/// The same for all samples of a batch.
+/// Of all samples of a batch, or one for each; null where it is not finite.
 template <class T>
-KernelBatch<T> laplacian(const LaplacianParameters& p) {
-  return {true, [p](int64_t) -> std::unique_ptr<Kernel<T>> {
+KernelBatch<T> laplacian(std::vector<LaplacianParameters> of_samples) {
+  const bool is_shared = of_samples.size() == 1;
+  return {is_shared, [of_samples = std::move(of_samples)](int64_t s) -> std::unique_ptr<Kernel<T>> {
+            const auto& p = of_samples[of_samples.size() == 1 ? 0 : s];
+            if (!std::isfinite(p.centre)) return nullptr;
             switch (p.dim) {
               case 1: return std::make_unique<Laplacian<T, 1>>(p);
               case 2: return std::make_unique<Laplacian<T, 2>>(p);

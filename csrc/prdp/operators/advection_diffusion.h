@@ -14,7 +14,7 @@ struct AxisWinds {
 /// forward difference. The derivative of max(w, 0) and min(w, 0) at w = 0 is 1/2. Differentiable.
 class AdvectionDiffusion {
  public:
-  /// `winds` in the order of the grid's axes.
+  /// `winds` in the order of the grid's axes; nu beside (batch, channel, *shape).
   AdvectionDiffusion(const Grid& grid, std::vector<AxisWinds> winds, at::Tensor nu, double alpha, double beta);
 
   at::Tensor apply(const at::Tensor& v) const;
@@ -32,7 +32,7 @@ class AdvectionDiffusion {
   /// that of u.
   struct Gradients {
     std::vector<AxisWinds> winds;
-    at::Tensor nu;
+    at::Tensor nu_terms;  // like u, whose sum is minus the derivative
   };
   Gradients product_rule(const at::Tensor& lambda, const at::Tensor& u) const;
 

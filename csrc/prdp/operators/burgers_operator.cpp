@@ -4,7 +4,6 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/upwind_kernels.h"
-#include "prdp/operators/upwind_rule_kernel.h"
 #include "prdp/operators/upwind_rule_loops.h"
 
 namespace prdp {
@@ -20,7 +19,7 @@ const AdvectionDiffusion& BurgersOperator::block() const {
     std::vector<AxisWinds> faces;
     for (int64_t d = 0; d < grid_.dim(); ++d)
       faces.push_back({backward_mean(wind_along(d), grid_, d), forward_mean(wind_along(d), grid_, d)});
-    made_.emplace(grid_, std::move(faces), step_.nu, 1.0, step_.dt);
+    made_.emplace(grid_, std::move(faces), step_.nu_beside(grid_.dim()), 1.0, step_.dt);
   }
   return *made_;
 }
@@ -28,12 +27,12 @@ const AdvectionDiffusion& BurgersOperator::block() const {
 std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   auto found = burgers_rule_by_kernel(grid_, winds_, step_.dt, lambda, u);
   if (!found) found = burgers_rule_on_loops(grid_, winds_, step_.dt, lambda, u);
-  if (found) return {found->winds, found->nu.to(step_.nu.options())};
-  const auto [faces, nu] = block().product_rule(lambda, u);
+  if (found) return gradients(*found);
+  const auto [faces, nu_terms] = block().product_rule(lambda, u);
   std::vector<at::Tensor> channels;
   for (int64_t d = grid_.dim() - 1; d >= 0; --d)  // the means, transposed
     channels.push_back(forward_mean(faces[d].lower, grid_, d) + backward_mean(faces[d].upper, grid_, d));
-  return {as_winds(std::move(channels)), nu.to(step_.nu.options())};
+  return gradients({as_winds(std::move(channels)), {nu_terms}});
 }
 
 at::Tensor BurgersOperator::solve_directly(const at::Tensor& b, bool transposed) const {
@@ -57,7 +56,7 @@ std::optional<gpu::OperatorView> BurgersOperator::gpu_view(const at::Tensor& b, 
 
 std::unique_ptr<Operator> BurgersOperator::select(const at::Tensor& index) const {
   auto chosen = std::make_unique<BurgersOperator>(*this);
-  chosen->winds_ = winds_of(index);
+  chosen->take_samples(index);
   chosen->made_.reset();
   return chosen;
 }

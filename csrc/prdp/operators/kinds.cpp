@@ -22,10 +22,10 @@ std::unique_ptr<Operator> make(const OperatorSpec& spec) {
 using Axes = std::vector<int64_t>;
 
 const std::vector<OperatorKind> kKinds{
-    {"heat", "Heat", make<HeatOperator>, Axes{0}},
+    {"heat", "Heat", make<HeatOperator>, Axes{1}},
     {"poisson", "Poisson", make<PoissonOperator>, Axes{}},
-    {"burgers", "Burgers", make<BurgersOperator>, Axes{kLikeState, 0}},
-    {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0},
+    {"burgers", "Burgers", make<BurgersOperator>, Axes{kLikeState, 1}},
+    {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 1},
      /*takes_null_spaces=*/false, /*has_pressure=*/true},
     {"diffusion", "Diffusion", make<DiffusionOperator>, Axes{kLikeField, kLikeField, kLikeSide},
      /*takes_null_spaces=*/true},

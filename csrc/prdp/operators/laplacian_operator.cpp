@@ -53,11 +53,12 @@ at::Tensor LaplacianOperator::solve_on_device(const at::Tensor& b) const {
   constexpr int64_t longest_alone = 4096;  // a longer basis takes more memory than the vectors of a large batch
   if (grid_.dim() == 1 && grid_.shape()[0] > longest_alone) {
     const double inverse_width2 = 1.0 / (grid_.dx(0) * grid_.dx(0));
-    const auto of = [&](double x) { return symbol(at::full({1}, x, real)); };
-    const auto beside = (of(inverse_width2) - of(0.0)).expand({grid_.shape()[0] - 1});
-    const auto coefficients = at::stack({of(-2.0 * inverse_width2).expand({grid_.shape()[0]}),
-                                         at::constant_pad_nd(beside, {1, 0}), at::constant_pad_nd(beside, {0, 1})});
-    return CyclicReduction(coefficients.unsqueeze(0), 0.0).solve(b.to(real)).to(b.scalar_type());
+    const auto of = [&](double x) { return symbol(at::full({1}, x, real)).reshape({-1, 1}).to(real); };
+    const auto beside = (of(inverse_width2) - of(0.0)).expand({-1, grid_.shape()[0] - 1});
+    const auto coefficients = at::stack({of(-2.0 * inverse_width2).expand({-1, grid_.shape()[0]}),
+                                         at::constant_pad_nd(beside, {1, 0}), at::constant_pad_nd(beside, {0, 1})},
+                                        1);
+    return CyclicReduction(coefficients, 0.0).solve(b.to(real)).to(b.scalar_type());
   }
   const auto axes = SineAxes::find_or_make(grid_, real);
   const auto waves = along_axes(b, axes->bases, /*transposed=*/false) / symbol(axes->eigenvalues);
@@ -71,9 +72,12 @@ at::Tensor LaplacianOperator::solve_directly(const at::Tensor& b, bool /*transpo
 }
 
 at::Tensor LaplacianOperator::norm() const {
-  const auto [alpha, beta] = coefficients();
   const double centre = laplacian_diagonal(grid_);
-  return at::scalar_tensor(std::abs(alpha + beta * centre) + std::abs(beta * centre), at::kDouble);
+  std::vector<double> norms;
+  for (const auto& [alpha, beta] : coefficients())
+    norms.push_back(std::abs(alpha + beta * centre) + std::abs(beta * centre));
+  const auto all = at::tensor(norms, at::kDouble);
+  return norms.size() == 1 ? all.squeeze(0) : all;
 }
 
 at::Tensor LaplacianOperator::jacobi_radius() const {
@@ -84,15 +88,19 @@ at::Tensor LaplacianOperator::jacobi_radius() const {
 std::vector<int64_t> LaplacianOperator::vector_shape() const { return with_channels(1, grid_.shape()); }
 
 std::shared_ptr<const kernels::Kernels> LaplacianOperator::kernels(const at::Tensor& b, bool) const {
-  const auto [alpha, beta] = coefficients();
-  kernels::LaplacianParameters k;
-  k.dim = grid_.dim();
-  k.centre = alpha + beta * laplacian_diagonal(grid_);
-  for (int64_t d = 0; d < k.dim; ++d) {
-    k.shape[d] = grid_.shape()[d];
-    k.off[d] = beta / (grid_.dx(d) * grid_.dx(d));
+  std::vector<kernels::LaplacianParameters> of_samples;
+  for (const auto& [alpha, beta] : coefficients()) {
+    kernels::LaplacianParameters k;
+    k.dim = grid_.dim();
+    k.centre = alpha + beta * laplacian_diagonal(grid_);
+    for (int64_t d = 0; d < k.dim; ++d) {
+      k.shape[d] = grid_.shape()[d];
+      k.off[d] = beta / (grid_.dx(d) * grid_.dx(d));
+    }
+    of_samples.push_back(k);
   }
-  return kernels::make_kernels(b.scalar_type() == at::kFloat, [&]<class T>(T) { return kernels::laplacian<T>(k); });
+  return kernels::make_kernels(b.scalar_type() == at::kFloat,
+                               [&]<class T>(T) { return kernels::laplacian<T>(std::move(of_samples)); });
 }
 
 std::optional<gpu::OperatorView> LaplacianOperator::gpu_view(const at::Tensor& b, bool) const {
@@ -102,8 +110,8 @@ std::optional<gpu::OperatorView> LaplacianOperator::gpu_view(const at::Tensor& b
   view.numbers = {alpha, beta, 0.0, 0.0, 0.0};  // 1/h² along z, y and x
   for (int64_t d = 0; d < dim; ++d) view.numbers[5 - dim + d] = 1.0 / (grid_.dx(d) * grid_.dx(d));
   if (!nu.defined()) return view;
-  if (nu.is_cpu()) view.numbers[1] *= number_of(nu);
-  else view.tensors = {nu.detach().to(b.scalar_type()).reshape({1})};  // nobody waits for it
+  if (nu.is_cpu() && nu.dim() == 0) view.numbers[1] *= number_of(nu);
+  else view.tensors = {nu.detach().to(b.scalar_type()).reshape({-1, 1})};  // nobody waits for it
   return view;
 }
 
@@ -116,7 +124,24 @@ HeatOperator::HeatOperator(const OperatorSpec& spec)
     : LaplacianOperator(Grid("Heat", spec.shape, Boundary::kDirichlet, lengths_of(spec, 1))),
       step_("Heat", spec, 1, "one tensor, nu") {}
 
-at::Tensor HeatOperator::apply(const at::Tensor& v) const { return v - (step_.nu * step_.dt) * laplacian(v, grid_); }
+void HeatOperator::check_vector(const at::Tensor& b) const {
+  LaplacianOperator::check_vector(b);
+  step_.check_vector(b);
+}
+
+at::Tensor HeatOperator::apply(const at::Tensor& v) const { return v - diffusion() * laplacian(v, grid_); }
+
+std::vector<LaplacianOperator::Coefficients> HeatOperator::coefficients() const {
+  std::vector<Coefficients> of_samples;
+  for (const double nu : step_.nu_values()) of_samples.push_back({1.0, -nu * step_.dt});
+  return of_samples;
+}
+
+std::unique_ptr<Operator> HeatOperator::select(const at::Tensor& index) const {
+  auto chosen = std::make_unique<HeatOperator>(*this);
+  chosen->step_.nu = step_.nu_of(index);
+  return chosen;
+}
 
 namespace {
 
@@ -143,13 +168,12 @@ std::vector<at::Tensor> HeatOperator::product_rule(const at::Tensor& lambda, con
   if (has_product_rule_kernel(lambda, u)) {
     const auto by_kernel =
         u.scalar_type() == at::kFloat ? product_with_laplacian<float> : product_with_laplacian<double>;
-    const auto product = by_kernel(lambda.contiguous(), u.contiguous(), grid_, step_.nu);
-    if (product.defined()) return {(product * -step_.dt).to(step_.nu.options())};
+    const auto product = by_kernel(lambda.contiguous(), u.contiguous(), grid_, step_.nu_beside(grid_.dim()));
+    if (product.defined()) return {(product * -step_.dt).reshape(step_.nu.sizes()).to(step_.nu.options())};
   }
   const bool by_loops = !at::GradMode::is_enabled() && is_plain(u) && is_plain(lambda) && !has_tangent(u);
   const auto lu = by_loops ? apply_on_loops(PoissonOperator(grid_), u, /*transposed=*/false) : laplacian(u, grid_);
-  const auto derivative = total(lambda * lu) * -step_.dt;
-  return {derivative.to(step_.nu.options())};
+  return {step_.gradient(lambda * lu) * -step_.dt};
 }
 
 }  // namespace prdp

@@ -23,18 +23,19 @@ class LaplacianOperator : public Operator {
  protected:
   explicit LaplacianOperator(Grid grid) : grid_(std::move(grid)) {}
 
-  /// α and β as numbers, for the CPU loops.
+  /// α and β as numbers, for the CPU loops: one pair, or one for each sample.
   struct Coefficients {
     double alpha, beta;
   };
-  virtual Coefficients coefficients() const = 0;
+  virtual std::vector<Coefficients> coefficients() const = 0;
   /// The same with β as a number times nu; without nu, the number alone.
   struct Factors {
     double alpha, beta;
     at::Tensor nu{};
   };
   virtual Factors factors() const = 0;
-  /// α + β x for a tensor x in L's place (its diagonal, its eigenvalues); differentiable.
+  /// α + β x for a tensor x in L's place, a number or (*shape) (its diagonal, its eigenvalues), beside vectors;
+  /// differentiable.
   virtual at::Tensor symbol(const at::Tensor& x) const = 0;
 
   Grid grid_;
@@ -56,25 +57,29 @@ class PoissonOperator final : public LaplacianOperator {
   std::vector<at::Tensor> product_rule(const at::Tensor&, const at::Tensor&) const override { return {}; }
 
  private:
-  Coefficients coefficients() const override { return {0.0, 1.0}; }
+  std::vector<Coefficients> coefficients() const override { return {{0.0, 1.0}}; }
   Factors factors() const override { return {0.0, 1.0}; }
   at::Tensor symbol(const at::Tensor& x) const override { return x; }
 };
 
 /// One implicit Euler step of the heat equation, A = I - ν Δt L; parameters (dt, length per axis if not
-/// 1), tensors (nu).
+/// 1), tensors (nu), as in StepParameters.
 class HeatOperator final : public LaplacianOperator {
  public:
   explicit HeatOperator(const OperatorSpec& spec);
   void check_parameters(Checks checks) const override { step_.check_values(checks); }
   at::Tensor apply(const at::Tensor& v) const override;
-  std::unique_ptr<Operator> select(const at::Tensor&) const override { return std::make_unique<HeatOperator>(*this); }
+  void check_vector(const at::Tensor& b) const override;
+  std::string refusal(int64_t sample) const override { return step_.refusal(sample); }
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
 
  private:
-  Coefficients coefficients() const override { return {1.0, -step_.nu_value() * step_.dt}; }
+  std::vector<Coefficients> coefficients() const override;
   Factors factors() const override { return {1.0, -step_.dt, step_.nu}; }
-  at::Tensor symbol(const at::Tensor& x) const override { return 1.0 - (step_.nu * step_.dt) * x; }
+  at::Tensor symbol(const at::Tensor& x) const override { return 1.0 - diffusion() * x; }
+  /// ν Δt, beside vectors.
+  at::Tensor diffusion() const { return step_.nu_beside(grid_.dim()) * step_.dt; }
 
   StepParameters step_;
 };

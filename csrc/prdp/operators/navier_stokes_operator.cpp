@@ -5,7 +5,6 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/upwind_kernels.h"
-#include "prdp/operators/upwind_rule_kernel.h"
 #include "prdp/operators/upwind_rule_loops.h"
 
 namespace prdp {
@@ -44,7 +43,8 @@ const NavierStokesOperator::Momentum& NavierStokesOperator::momentum() const {
     const auto u1 = wind_along(kX), u2 = wind_along(kY);
     const auto v1 = at_u2_points(u1, grid_), v2 = at_u1_points(u2, grid_);
     const auto c = [&](const at::Tensor& along_y, const at::Tensor& along_x) {
-      return AdvectionDiffusion(grid_, {{along_y, along_y}, {along_x, along_x}}, step_.nu, 1.0 / step_.dt, 1.0);
+      return AdvectionDiffusion(grid_, {{along_y, along_y}, {along_x, along_x}}, step_.nu_beside(2), 1.0 / step_.dt,
+                                1.0);
     };
     made_.emplace(Momentum{c(v2, u1), c(u2, v1)});
   }
@@ -95,14 +95,14 @@ at::Tensor NavierStokesOperator::norm_of(const at::Tensor& of_c1, const at::Tens
 std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   auto found = navier_stokes_rule_by_kernel(grid_, winds_, lambda, u);
   if (!found) found = navier_stokes_rule_on_loops(grid_, winds_, lambda, u);
-  if (found) return {found->winds, found->nu.to(step_.nu.options())};
+  if (found) return gradients(*found);
   const auto& [c1, c2] = momentum();
   const auto g1 = c1.product_rule(part(lambda, 0), part(u, 0));
   const auto g2 = c2.product_rule(part(lambda, 1), part(u, 1));
   const auto both = [](const AxisWinds& w) { return w.lower + w.upper; };
   const auto u1 = both(g1.winds[kX]) + at_u1_points(both(g2.winds[kX]), grid_);
   const auto u2 = both(g2.winds[kY]) + at_u2_points(both(g1.winds[kY]), grid_);
-  return {as_winds({u1, u2}), (g1.nu + g2.nu).to(step_.nu.options())};
+  return gradients({as_winds({u1, u2}), {g1.nu_terms, g2.nu_terms}});
 }
 
 at::Tensor NavierStokesOperator::regular_matrix() const {
@@ -133,7 +133,7 @@ std::optional<gpu::OperatorView> NavierStokesOperator::gpu_view(const at::Tensor
 
 std::unique_ptr<Operator> NavierStokesOperator::select(const at::Tensor& index) const {
   auto chosen = std::make_unique<NavierStokesOperator>(*this);
-  chosen->winds_ = winds_of(index);
+  chosen->take_samples(index);
   chosen->made_.reset();
   return chosen;
 }

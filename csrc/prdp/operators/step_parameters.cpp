@@ -3,6 +3,12 @@
 #include <ATen/TensorSubclassLikeUtils.h>
 
 #include <cmath>
+#include <limits>
+#include <numeric>
+#include <sstream>
+
+#include "prdp/operators/sums_in_order.h"
+#include "prdp/operators/tensors.h"
 
 namespace prdp {
 
@@ -18,15 +24,64 @@ StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t
   dt = spec.parameters[0];
   nu = spec.tensors.back();
   TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0.0, owner, ": dt must be finite and > 0, got ", dt);
-  TORCH_CHECK_VALUE(nu.dim() == 0, owner, ": nu must be a number or a 0-dimensional tensor, got shape ", nu.sizes());
+  TORCH_CHECK_VALUE(nu.dim() <= 1, owner,
+                    ": nu must be a number, a 0-dimensional tensor, or (batch,), one for each "
+                    "sample, got shape ",
+                    nu.sizes());
   TORCH_CHECK_TYPE(at::isFloatingType(nu.scalar_type()), owner, ": nu must be a real number, got ", nu.scalar_type());
+}
+
+namespace {
+bool is_allowed(double nu) { return std::isfinite(nu) && nu >= 0.0; }
+}  // namespace
+
+void StepParameters::check_vector(const at::Tensor& b) const {
+  if (has_axis()) check_goes_with(nu, b, owner, "the values of nu");
 }
 
 void StepParameters::check_values(Checks checks) const {
   if (checks == Checks::kHost && !nu.is_cpu()) return;
+  if (checks == Checks::kShared && has_axis()) return;
   if (at::isTensorSubclassLike(nu)) return;  // no number yet; the solve checks it once there is one
-  const double value = nu_value();
-  TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0.0, owner, ": nu must be finite and >= 0, got ", value);
+  const auto values = to_host<double>(nu, nu.numel());
+  for (size_t i = 0; i < values.size(); ++i)
+    TORCH_CHECK_VALUE(is_allowed(values[i]), owner, ": nu must be finite and >= 0, got ", values[i],
+                      has_axis() ? " in sample " + std::to_string(i) : "");
+}
+
+std::string StepParameters::refusal(int64_t sample) const {
+  if (!has_axis()) return {};
+  const auto value = nu[nu.size(0) == 1 ? 0 : sample].item<double>();
+  if (is_allowed(value) || !std::isfinite(value)) return {};
+  std::ostringstream text;
+  text << "nu must be >= 0, got " << value << "; what a network predicts should end in exp or softplus";
+  return text.str();
+}
+
+std::vector<double> StepParameters::nu_values() const {
+  if (!has_axis()) return {number_of(nu)};
+  auto values = to_host<double>(nu, nu.size(0));
+  for (auto& value : values)
+    if (!is_allowed(value)) value = std::numeric_limits<double>::quiet_NaN();
+  return values;
+}
+
+at::Tensor StepParameters::nu_beside(int64_t axes) const {
+  if (!has_axis()) return nu;
+  auto shape = nu.sym_sizes().vec();
+  shape.resize(2 + axes, 1);
+  return nu.view_symint(shape);
+}
+
+at::Tensor StepParameters::nu_of(const at::Tensor& index) const {
+  return has_axis() && nu.size(0) != 1 ? nu.index_select(0, index) : nu;
+}
+
+at::Tensor StepParameters::gradient(const at::Tensor& terms) const {
+  if (!has_axis() || nu.sym_size(0) == 1) return total(terms).reshape_symint(nu.sym_sizes()).to(nu.options());
+  std::vector<int64_t> axes(terms.dim() - 1);
+  std::iota(axes.begin(), axes.end(), 1 - terms.dim());
+  return (axes.empty() ? terms : sum_in_order(terms, axes).flatten()).to(nu.options());
 }
 
 double number_of(const at::Tensor& t) {

@@ -1,4 +1,6 @@
 #pragma once
+#include <cmath>
+
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/upwind_rows.h"
 #include "prdp/operators/upwind_operator.h"
@@ -15,15 +17,23 @@ std::shared_ptr<const kernels::Kernels> UpwindOperator::upwind_kernels(const at:
     length[2 - dim + d] = grid_.length(static_cast<int64_t>(d));
     extent[2 - dim + d] = grid_.shape()[d];
   }
-  const auto of_samples = [=, winds = winds_.detach().to(at::kCPU).contiguous(), nu = step_.nu_value(),
+  const auto of_samples = [=, winds = winds_.detach().to(at::kCPU).contiguous(), nu = step_.nu_values(),
                            dt = step_.dt]<class T>(T) -> kernels::KernelBatch<T> {
-    const bool shared = winds.size(0) == 1;
-    const int64_t stride = shared ? 0 : winds.stride(0);
+    const int64_t stride = winds.size(0) == 1 ? 0 : winds.stride(0);
     using Parameters = kernels::UpwindParameters<T>;
     const auto pattern = Parameters::of_grid(static_cast<int64_t>(dim), extent[0], extent[1]);
-    return {shared, [=](int64_t s) {
-              return make(Parameters{winds.const_data_ptr<T>() + s * stride, extent[0], extent[1], nu, dt, transposed,
-                                     length[0], length[1], pattern});
+    return {winds.size(0) == 1 && nu.size() == 1, [=](int64_t s) {
+              const double mine = nu[nu.size() == 1 ? 0 : s];
+              const auto p = Parameters{winds.const_data_ptr<T>() + s * stride,
+                                        extent[0],
+                                        extent[1],
+                                        mine,
+                                        dt,
+                                        transposed,
+                                        length[0],
+                                        length[1],
+                                        pattern};
+              return std::isfinite(mine) ? make(p) : nullptr;
             }};
   };
   return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);

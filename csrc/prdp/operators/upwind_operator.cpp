@@ -13,6 +13,7 @@ UpwindOperator::UpwindOperator(const char* owner, const OperatorSpec& spec, int6
 void UpwindOperator::check_vector(const at::Tensor& b) const {
   grid_.check_field(b, channels_);
   check_goes_with(winds_, b, step_.owner, "the winds");
+  step_.check_vector(b);
 }
 
 std::vector<int64_t> UpwindOperator::vector_shape() const { return with_channels(channels_, grid_.shape()); }
@@ -28,6 +29,12 @@ at::Tensor UpwindOperator::as_winds(std::vector<at::Tensor> channels) const {
   return winds_.sym_size(0) == 1 ? all.sum(0, /*keepdim=*/true) : all;
 }
 
+std::vector<at::Tensor> UpwindOperator::gradients(const UpwindGradients& found) const {
+  at::Tensor nu;
+  for (const auto& terms : found.nu_terms) add_to(nu, -step_.gradient(terms));
+  return {found.winds, nu};
+}
+
 at::Tensor UpwindOperator::largest(const at::Tensor& row_norms) const {
   const auto norms = row_norms.flatten(1).amax(1);
   return norms.size(0) == 1 ? norms.squeeze(0) : norms;
@@ -41,8 +48,8 @@ gpu::OperatorView UpwindOperator::upwind_view(const at::Tensor& b, const std::st
   view.tensors = {(winds_.scalar_type() == b.scalar_type() ? winds_ : winds_.to(b.scalar_type())).contiguous()};
   view.numbers = {alpha, beta, 1.0, dim > 1 ? 1.0 / grid_.dx(0) : 0.0, 1.0 / grid_.dx(dim - 1)};
   const auto& nu = step_.nu;
-  if (nu.is_cpu()) view.numbers[2] = step_.nu_value();
-  else view.tensors.push_back(nu.detach().to(b.scalar_type()).reshape({1}));  // nobody waits for it
+  if (nu.is_cpu() && !step_.has_axis()) view.numbers[2] = number_of(nu);
+  else view.tensors.push_back(nu.detach().to(b.scalar_type()).reshape({-1, 1}));  // nobody waits for it
   return view;
 }
 

@@ -3,17 +3,19 @@
 #include "prdp/grid/grid.h"
 #include "prdp/operators/operator.h"
 #include "prdp/operators/step_parameters.h"
+#include "prdp/operators/upwind_rule_kernel.h"
 
 namespace prdp {
 
 /// The base of Burgers and Navier-Stokes: one step of a flow on a periodic grid, linearised about given winds.
 /// Parameters: dt, and the length per axis if not 1. Tensors: the winds and nu. The winds are (batch, channels,
-/// *shape), or (1, channels, *shape) if all samples share them. Channel 0 is the velocity along x, the last axis;
-/// channel 1 along y.
+/// *shape), or (1, channels, *shape) if all samples share them; nu is that of StepParameters. Channel 0 is the velocity
+/// along x, the last axis; channel 1 along y.
 class UpwindOperator : public Operator {
  public:
   void check_vector(const at::Tensor& b) const override;
   void check_parameters(Checks checks) const override { step_.check_values(checks); }
+  std::string refusal(int64_t sample) const override { return step_.refusal(sample); }
   std::vector<int64_t> vector_shape() const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
 
@@ -32,10 +34,13 @@ class UpwindOperator : public Operator {
   at::Tensor wind_along(int64_t axis) const { return winds_.narrow(1, grid_.dim() - 1 - axis, 1); }
   /// The gradient of the winds from those of its channels, summed over the samples that share them.
   at::Tensor as_winds(std::vector<at::Tensor> channels) const;
+  std::vector<at::Tensor> gradients(const UpwindGradients& found) const;
   /// Largest of the row norms, one per sample, or one value where the winds are shared.
   at::Tensor largest(const at::Tensor& row_norms) const;
-  at::Tensor winds_of(const at::Tensor& index) const {
-    return winds_.size(0) == 1 ? winds_ : winds_.index_select(0, index);
+  /// Keeps the winds and nu of the samples `index`.
+  void take_samples(const at::Tensor& index) {
+    if (winds_.size(0) != 1) winds_ = winds_.index_select(0, index);
+    step_.nu = step_.nu_of(index);
   }
 
   Grid grid_;

@@ -4,7 +4,6 @@
 
 #include "prdp/gpu/device/upwind_product_rule.h"
 #include "prdp/operators/product_rule_kernels.h"
-#include "prdp/operators/sums_in_order.h"
 
 namespace prdp {
 
@@ -42,7 +41,7 @@ std::optional<UpwindGradients> products(const Grid& grid, const at::Tensor& wind
   if (!gpu::each_sample(out.device(), product_rule_body<T>("ViscosityProductRule", kHeader), of,
                         channels * of.pair.points, batch))
     return std::nullopt;
-  return UpwindGradients{out, total(sums)};
+  return UpwindGradients{out, {-sums}};
 }
 
 }  // namespace

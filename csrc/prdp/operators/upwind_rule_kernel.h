@@ -1,15 +1,17 @@
 #pragma once
 #include <optional>
+#include <vector>
 
 #include "prdp/grid/grid.h"
 
 namespace prdp {
 
-/// ∂⟨λ, A u⟩ for the winds of Burgers or Navier-Stokes, like them, and for ν, a number: one launch each on a GPU;
-/// nothing where there are no kernels.
+/// ∂⟨λ, A u⟩ for the winds of Burgers or Navier-Stokes, like them, and for ν.
 struct UpwindGradients {
-  at::Tensor winds, nu;
+  at::Tensor winds;
+  std::vector<at::Tensor> nu_terms;  // each (batch, …), whose sums are minus the derivative
 };
+/// One launch each on a GPU; nothing where there are no kernels.
 /// I + β (Γ - ν L) on every channel.
 std::optional<UpwindGradients> burgers_rule_by_kernel(const Grid& grid, const at::Tensor& winds, double beta,
                                                       const at::Tensor& lambda, const at::Tensor& u);

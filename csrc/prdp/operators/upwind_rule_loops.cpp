@@ -8,7 +8,6 @@
 #include "prdp/gpu/device/upwind_product_rule.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/sets_of_samples.h"
-#include "prdp/operators/sums_in_order.h"
 
 namespace prdp {
 
@@ -160,9 +159,7 @@ UpwindGradients products(const Grid& grid, const at::Tensor& winds, T beta, int6
             plane, beta, fields.lambda + s * stride + c * points, fields.u + s * stride + c * points,
             terms.mutable_data_ptr<T>() + ((c / at_once * batch + first + s) * at_once + c % at_once) * points);
   });
-  auto nu = -total(terms[0]);
-  for (int64_t k = 1; k < terms.size(0); ++k) nu = nu - total(terms[k]);
-  return {sets.count > w.size(0) ? out.sum(0, /*keepdim=*/true) : out, nu};
+  return {sets.count > w.size(0) ? out.sum(0, /*keepdim=*/true) : out, terms.unbind()};
 }
 
 bool has_loops(const at::Tensor& winds, const at::Tensor& lambda, const at::Tensor& u) {

@@ -40,7 +40,8 @@ class Poisson : public Stepper {
   Poisson(std::vector<int64_t> shape, Solver solver, Backward backward = Backward::kImplicit, Length length = 1.0);
 };
 
-/// nu >= 0 in length²/time: a number, or a 0-dimensional tensor, which gets a gradient.
+/// nu >= 0 in length²/time: a number, or a tensor, which gets a gradient: 0-dimensional, or (batch,), one for each
+/// sample, in the dtype of the states.
 struct Viscosity {
   Viscosity(double nu);
   Viscosity(at::Tensor nu) : tensor(std::move(nu)) {}

@@ -26,7 +26,7 @@ class Upwind {
         alpha_(static_cast<T>(a.numbers[0])),
         beta_(static_cast<T>(a.numbers[1])),
         inverse_h_{static_cast<T>(a.numbers[4]), static_cast<T>(a.numbers[3])} {
-    const T* const by = static_cast<const T*>(a.tensors[1]);
+    const T* const by = a.tensors[1] ? static_cast<const T*>(a.tensors[1]) + sample * a.sample_strides[1] : nullptr;
     constexpr double not_allowed = std::numeric_limits<double>::quiet_NaN();
     nu_ = !by ? a.numbers[2] : *by >= T(0) ? a.numbers[2] * static_cast<double>(*by) : not_allowed;
     for (int axis = 0; axis < 2; ++axis)

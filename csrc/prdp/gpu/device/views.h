@@ -67,7 +67,7 @@ void for_each_nearest(T centre, T z, T y, T x, const F& f) {
 }
 
 /// α I + β L with the Laplacian L of a box, zero outside the grid. Numbers: α, β, and 1/h² along z, y and x. Tensor,
-/// where it is there: a number that β is multiplied by.
+/// where it is there: a number that β is multiplied by, (batch or 1, 1).
 template <class T, class G>
 class Laplacian {
  public:
@@ -75,8 +75,8 @@ class Laplacian {
   static constexpr bool kKnowsRadius = true;
   static constexpr bool kIsScaled = true;
 
-  Laplacian(const OperatorArguments& a, int64_t) {
-    const T* const by = static_cast<const T*>(a.tensors[0]);
+  Laplacian(const OperatorArguments& a, int64_t sample) {
+    const T* const by = a.tensors[0] ? static_cast<const T*>(a.tensors[0]) + sample * a.sample_strides[0] : nullptr;
     const double beta = by ? a.numbers[1] * static_cast<double>(*by) : a.numbers[1];
     constexpr int kExtents[3] = {G::kZ, G::kY, G::kX};
     constexpr double kPi = 3.141592653589793;
