@@ -172,9 +172,9 @@ class Flow(HoldsTensors, Stepper):
         Raises ValueError or TypeError for a u that does not fit, and with on_failure="raise" `torch.linalg.LinAlgError`
         where a sample fails, as in a step that is too long."""
         u = _field("Flow", "u", u)
-        log = self._adjoint_log.number
-        found: Solution = self._equation().step(u, self._options_kept(), self._max_iter, log)
-        self._keep(found[1:], self._adjoint_log, found[0])
+        log = self._log()
+        found: Solution = self._equation().step(u, self._options_kept(), self._max_iter, log.number)
+        self._keep(found[1:], log, found[0])
         return found[0]
 
     @not_in_graphs
@@ -183,9 +183,9 @@ class Flow(HoldsTensors, Stepper):
         """Return the next state, (batch, d, *shape), and the `pressure` of the step, (batch, 1, *shape), by one step.
         Its gradient takes one adjoint step. Raises as `forward`."""
         u = _field("Flow", "u", u)
-        log = self._adjoint_log.number
-        found: Solution = self._equation().step_and_pressure(u, self._options_kept(), self._max_iter, log)
-        self._keep(found[1:], self._adjoint_log, found[0])
+        log = self._log()
+        found: Solution = self._equation().step_and_pressure(u, self._options_kept(), self._max_iter, log.number)
+        self._keep(found[1:], log, found[0])
         d = len(self.shape)
         return found[0][:, :d], found[0][:, d:]
 
@@ -201,9 +201,9 @@ class Flow(HoldsTensors, Stepper):
             return super().rollout(u, steps)
         u = _field("Flow", "u", u)
         steps = _check.whole("rollout", "steps", steps)
-        log = self._adjoint_log.number
-        found: Solution = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log)
-        self._keep(found[1:], self._adjoint_log, found[0])
+        log = self._log()
+        found: Solution = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log.number)
+        self._keep(found[1:], log, found[0])
         return found[0]
 
     @not_in_graphs

@@ -1,6 +1,6 @@
 """Tensors of a step that are state, and those that were set for the next steps alone."""
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -15,15 +15,18 @@ class HoldsTensors(torch.nn.Module):
     """
 
     def _hold(self, name: str, value: object) -> None:
-        """Make it state, in place of what is there."""
-        for place in (vars(self), self._lent(), self._buffers, self._parameters):
-            place.pop(name, None)
-        if isinstance(value, torch.nn.Parameter):
-            self.register_parameter(name, value)
-        elif value is None or isinstance(value, Tensor):
-            self.register_buffer(name, value)
-        else:
-            vars(self)[name] = value
+        """Make it state, in place of what is there. Whoever is interrupted leaves the old one or the new one."""
+        is_parameter, is_buffer = isinstance(value, torch.nn.Parameter), value is None or isinstance(value, Tensor)
+        if not hasattr(self, name) and is_parameter:
+            return self.register_parameter(name, cast(torch.nn.Parameter, value))
+        if not hasattr(self, name) and is_buffer:
+            return self.register_buffer(name, cast(Tensor | None, value))
+        new: dict[str, Any] = self._parameters if is_parameter else self._buffers if is_buffer else vars(self)
+        new[name] = value
+        self._non_persistent_buffers_set.discard(name)
+        for place in (self._buffers, self._parameters, self._lent(), vars(self)):
+            if place is not new:
+                place.pop(name, None)
 
     def _set(self, name: str, value: object) -> None:
         """As it is set by a user."""

@@ -1,7 +1,9 @@
 """`Stepper`: what all steppers have in common, and the base of those that solve A(u) u_next = b(u)."""
 
+import contextvars
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
 import torch
@@ -16,6 +18,24 @@ from prdp_torch.solve import AdjointLog, AdjointLogs, LogOfRollout, SolveInfo
 from prdp_torch.solvers import Solver
 from prdp_torch.stepper_settings import HasSettings
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Report, Solution, Start
+
+
+@dataclass
+class _Call:
+    """A call of a module by its rollout, in the context of that call alone: threads and interrupts leave no trace."""
+
+    stepper: "Stepper"
+    log: AdjointLog
+    outer: "_Call | None"
+    info: SolveInfo | None = None
+
+
+_call: contextvars.ContextVar[_Call | None] = contextvars.ContextVar("prdp_call_of_rollout", default=None)
+
+
+def _make(call: _Call, u: Tensor) -> Tensor:
+    _call.set(call)
+    return call.stepper(u)
 
 
 class Stepper(HasSettings):
@@ -49,7 +69,7 @@ class Stepper(HasSettings):
     """
 
     info: SolveInfo | None
-    _is_rolling_out = False  # while a rollout calls the module
+    _is_rolling_out = False  # while a rollout calls the module in a graph
 
     if TYPE_CHECKING:
 
@@ -97,9 +117,10 @@ class Stepper(HasSettings):
 
         Raises ValueError or TypeError for a u that does not fit, and with on_failure="raise" `torch.linalg.LinAlgError`
         where a sample fails."""
-        found = self._solve(u, self._adjoint_log)
+        log = self._log()
+        found = self._solve(u, log)
         u_next, report = found[0], found[1:]
-        self._keep(report, self._adjoint_log, u_next)
+        self._keep(report, log, u_next)
         return u_next
 
     @forgets_if_it_raises
@@ -145,11 +166,15 @@ class Stepper(HasSettings):
 
     def _called(self, u: Tensor, log: AdjointLog) -> tuple[Tensor, ...]:
         """What a call of the module makes of u, and the report of its last step: none if it makes none."""
-        if self._is_rolling_out:
+        if self._is_rolling_out or self._call_of_rollout() is not None:
             raise RuntimeError(
                 f"{type(self).__name__}.rollout: it repeats the calls of the module, and its forward calls rollout; "
                 "let the forward call the rollout of a step that the module holds"
             )
+        if not torch.compiler.is_compiling():
+            call = _Call(self, log, _call.get())
+            state = contextvars.copy_context().run(_make, call, u)
+            return state, *(() if call.info is None else call.info[:5])
         own = self._adjoint_log
         self._adjoint_log, self.info, self._is_rolling_out = log, None, True
         try:
@@ -157,6 +182,20 @@ class Stepper(HasSettings):
         finally:
             self._adjoint_log, self._is_rolling_out = own, False
         return state, *(() if self.info is None else self.info[:5])
+
+    def _call_of_rollout(self) -> _Call | None:
+        """The call of this module that a rollout makes, if it does."""
+        if torch.compiler.is_compiling():
+            return None
+        call = _call.get()
+        while call is not None and call.stepper is not self:
+            call = call.outer
+        return call
+
+    def _log(self) -> AdjointLog:
+        """Where a forward pass has its adjoint solve reported."""
+        call = self._call_of_rollout()
+        return self._adjoint_log if call is None else call.log
 
     def _keep(self, report: Report | None, log: AdjointLog | AdjointLogs, u: Tensor) -> None:
         """Keep the report of what made u. Without gradients, as in a validation, that of the last backward pass
@@ -175,6 +214,8 @@ class Stepper(HasSettings):
                 self.info = info
         else:  # past __setattr__ of modules, which takes as long as a small solve
             self.__dict__["info"] = info
+            if (call := self._call_of_rollout()) is not None:
+                call.info = info
 
     def _solve(self, u: Tensor, log: AdjointLog) -> Solution:
         """One step: u_next and its report."""

@@ -122,15 +122,15 @@ class EquationStepper(HoldsTensors, Stepper):
 
         Raises ValueError or TypeError for a u that does not fit, and with on_failure="raise" `torch.linalg.LinAlgError`
         where a sample fails."""
-        found: Solution | None = None
+        log, found = self._log(), None
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
-            log = self._adjoint_log.number
-            found = _C.step(u, self._tensors(), self._equation_kept(), self._options_kept(), self._max_iter, log)
+            settings = self._equation_kept(), self._options_kept(), self._max_iter
+            found = _C.step(u, self._tensors(), *settings, log.number)
         if found is None:
-            solution: Solution = torch.ops.prdp.step(u, *self._equation(), *self._packed_options(self._adjoint_log))
+            solution: Solution = torch.ops.prdp.step(u, *self._equation(), *self._packed_options(log))
             found = solution
-        self._keep(found[1:], self._adjoint_log, found[0])
+        self._keep(found[1:], log, found[0])
         return found[0]
 
     @forgets_if_it_raises
@@ -146,9 +146,9 @@ class EquationStepper(HoldsTensors, Stepper):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
-        packed = self._packed_options(self._adjoint_log)
-        found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *packed)
-        self._keep(found[1:], self._adjoint_log, found[0])
+        log = self._log()
+        found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._packed_options(log))
+        self._keep(found[1:], log, found[0])
         return found[0]
 
     def _equation(self) -> tuple[list[Tensor], str, list[int], list[float], int]:
@@ -261,8 +261,8 @@ class Heat(TimeStepper):
 
     Args:
         shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
-        nu: diffusivity >= 0, length²/time. A tensor gets a gradient: 0-dimensional, or (batch,), one for each sample,
-            in the dtype of the states. A Parameter becomes one of the module, and another tensor a buffer.
+        nu: diffusivity >= 0, length²/time; a number, or a tensor as in `operators.Heat`. A Parameter becomes one of
+            the module, and another tensor a buffer.
         dt: time step > 0. The larger nu dt/dx² is, the more iterations a solve takes.
         solver, backward and the other options: as in `Stepper`.
         length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).

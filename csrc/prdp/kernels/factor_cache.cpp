@@ -1,5 +1,7 @@
 #include "prdp/kernels/factor_cache.h"
 
+#include <pthread.h>
+
 #include <algorithm>
 #include <atomic>
 #include <bit>
@@ -81,6 +83,9 @@ struct Entry {
 using Entries = std::list<Entry>;  // the last used first
 
 std::mutex mutex;
+// A fork waits for the threads that hold it, as its child has none to unlock it.
+[[maybe_unused]] const int watches_forks =
+    pthread_atfork([] { mutex.lock(); }, [] { mutex.unlock(); }, [] { mutex.unlock(); });
 // Never destroyed: at the end of a process, memory of a device can no longer be freed.
 auto& entries = *new Entries;
 auto& evicted_names = *new Entries;
@@ -130,6 +135,8 @@ Kept find(const kernels::FactorKey& key, const std::type_info& type) {
 void keep(const kernels::FactorKey& key, const std::type_info& type, Kept kept, int64_t bytes) {
   std::vector<Kept> gone;  // destroyed without the lock
   const std::lock_guard lock(mutex);
+  constexpr int64_t of_objects = 4096;  // beside its numbers, about, as measured on small grids
+  bytes += of_objects;
   if (bytes > limit()) return;
   const Name name{key, type};
   if (const auto place = places.find(name); place != places.end()) {
