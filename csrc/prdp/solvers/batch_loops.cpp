@@ -176,6 +176,53 @@ at::Tensor combine(double sign, const Scalar* h, const std::vector<Vector>& v, i
   return square;
 }
 
+namespace {
+/// The rows of sample s of v, (m, batch, …).
+template <class T>
+std::vector<T*> rows_of(const at::Tensor& v, int64_t s, int64_t n) {
+  std::vector<T*> rows(v.size(0));
+  for (int64_t i = 0; i < v.size(0); ++i) rows[i] = v.mutable_data_ptr<T>() + (i * v.size(1) + s) * n;
+  return rows;
+}
+}  // namespace
+
+void orthogonalise(const at::Tensor& v, int64_t j, double least, Vector& w, const at::Tensor& h) {
+  const int64_t m = v.size(0), n = unknowns(w);
+  with_type(w, [&]<class T>(T) {
+    T* const taken = own<T>(w);
+    for_each_sample(w, [&](int64_t s, int64_t at) {
+      const AnyLength<T> loops;
+      const auto rows = rows_of<T>(v, s, n);
+      double* const column = h.mutable_data_ptr<double>() + s * (m + 1) * m + j;
+      std::vector<T> along(j + 1);
+      T square = 0;
+      for (int pass = 0; pass < 2; ++pass) {
+        loops.multi_dot(rows.data(), j + 1, T(1), taken + at, along.data(), n);
+        square = loops.multi_axpy(T(-1), along.data(), rows.data(), j + 1, T(1), taken + at, n);
+        for (int64_t i = 0; i <= j; ++i)
+          column[i * m] = static_cast<double>(along[i]) + (pass == 0 ? 0.0 : column[i * m]);
+      }
+      const double length = std::sqrt(static_cast<double>(square));
+      column[(j + 1) * m] = length;
+      if (j + 1 < m) loops.scale(static_cast<T>(1.0 / std::max(length, least)), taken + at, rows[j + 1], n);
+    });
+  });
+}
+
+Vector combination(const at::Tensor& v, const at::Tensor& y) {
+  auto sum = at::zeros_like(v[0]);
+  with_type(v, [&]<class T>(T) {
+    T* const to = sum.mutable_data_ptr<T>();
+    for_each_sample(sum, [&](int64_t s, int64_t at) {
+      const auto rows = rows_of<T>(v, s, unknowns(sum));
+      const double* const mine = y.const_data_ptr<double>() + s * v.size(0);
+      const std::vector<T> weights(mine, mine + v.size(0));
+      AnyLength<T>().multi_axpy(T(1), weights.data(), rows.data(), v.size(0), T(1), to + at, unknowns(sum));
+    });
+  });
+  return sum;
+}
+
 bool any(const Scalar& where) {
   return with_type(where, [&]<class T>(T) {
     const T* values = data<T>(where);

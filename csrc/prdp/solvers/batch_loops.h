@@ -36,6 +36,12 @@ void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, con
 Scalar combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar* factor,
                Vector& w, const Active& active);
 
+/// A step of Gram–Schmidt, twice: h_ij = v_i·w for i ≤ j, and w ← w - Σ h_ij v_i; then h_{j+1,j} = ‖w‖, and v_{j+1} =
+/// w/max(‖w‖, least) if there is such a row. v: (m, batch, …); h: (batch, m + 1, m) in float64.
+void orthogonalise(const at::Tensor& v, int64_t j, double least, Vector& w, const at::Tensor& h);
+/// Σ y_i v_i, for y (batch, m, 1) in float64.
+Vector combination(const at::Tensor& v, const at::Tensor& y);
+
 /// Whether a number is not zero.
 bool any(const Scalar& where);
 /// The rules of SampleNumbers, for each sample.

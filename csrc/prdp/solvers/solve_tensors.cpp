@@ -95,9 +95,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
     iterate(space, method, states, solver.rtol, request.guarded);
     return a.project_solution(space.solution(method.x));
   };
-  const bool by_tensor_gmres = solver.method == Method::kGmres && space.is_unrecorded_on_device();
-  auto u = by_tensor_gmres ? run(TensorGmres(space, solver.restart))
-                           : with_method(solver.method, solver.restart, space, run);
+  auto u = solver.method == Method::kGmres ? run(TensorGmres(space, solver.restart))
+                                           : with_method(solver.method, solver.restart, space, run);
   const auto largest_scaled = largest_magnitude(u) * batch.takes_part;
   u = at::where(per_sample(batch.takes_part, b), u / batch.scale, at::zeros_like(b));
   const auto largest = largest_magnitude(u);

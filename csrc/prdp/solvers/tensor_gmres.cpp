@@ -5,42 +5,26 @@
 #include <algorithm>
 #include <cmath>
 
-#include "prdp/solvers/hessenberg_problem.h"
+#include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/solve_damped.h"
 
 namespace prdp {
 
-namespace {
+double HostNumbers::inverse(double value, double scale) const {
+  return value <= 16 * epsilon * std::abs(scale) || value < negligible ? 0.0 : 1.0 / value;
+}
 
-/// Numbers of one sample on the host, which vanish where those of its dtype would.
-struct HostNumbers {
-  using Scalar = double;
-  double epsilon, negligible;
-
-  template <class X>
-  std::vector<X> array(int64_t n) const {
-    return std::vector<X>(n);
-  }
-
-  double inverse(double value, double scale) const {
-    return value <= 16 * epsilon * std::abs(scale) || value < negligible ? 0.0 : 1.0 / value;
-  }
-  double larger(double a, double b) const { return std::max(a, b); }
-  double is_larger(double a, double b) const { return a > b; }
-  double is_zero(double value) const { return value == 0.0; }
-  double is_not_zero(double value) const { return value != 0.0; }
-  bool surely_all(double value) const { return value != 0.0; }
-  void damp(const double* r, const double* g, int64_t n, double scale, double keep, double* y) const {
-    if (keep != 0.0) return;
-    std::vector<double> work(numbers_of_solve_damped(n));
-    solve_damped(r, g, n, epsilon * scale, y, work.data());
-  }
-};
-
-}  // namespace
+void HostNumbers::damp(const double* r, const double* g, int64_t n, double scale, double keep, double* y) const {
+  if (keep != 0.0) return;
+  std::vector<double> work(numbers_of_solve_damped(n));
+  solve_damped(r, g, n, epsilon * scale, y, work.data());
+}
 
 TensorGmres::TensorGmres(TensorSpace& space, int64_t restart)
-    : x(space.vector()), space_(space), m_(std::min(restart, space.unknowns())) {}
+    : x(space.vector()),
+      space_(space),
+      m_(std::min(restart, space.unknowns())),
+      numbers_{2 * space.epsilon(), space.negligible()} {}
 
 void TensorGmres::start() {
   x = space_.vector();
@@ -59,7 +43,8 @@ void TensorGmres::step() {
   kept_r_ = r_;
   extend_basis();
   const auto y = minimise();
-  at::Tensor d = at::bmm(rows(m_ - 1).mT(), y).view(space_.b().sizes());
+  at::Tensor d = space_.b().is_cpu() ? batch_loops::combination(v_, y) : at::bmm(rows(m_ - 1).mT(), y.to(h_.options()));
+  d = d.view(space_.b().sizes());
   if (space_.is_preconditioned()) {
     auto z = space_.vector();
     space_.precondition(d, z);
@@ -91,20 +76,66 @@ void TensorGmres::extend_basis() {
   const auto& b = space_.b();
   const int64_t batch = b.size(0);
   v_ = at::empty({m_, batch, space_.unknowns()}, b.options());  // a Function may keep what it was given before
-  h_ = at::zeros({batch, m_ + 1, m_}, b.options());
+  h_ = at::zeros({batch, m_ + 1, m_}, b.is_cpu() ? b.options().dtype(at::kDouble) : b.options());
+  if (b.is_cpu()) begin_cycles(residual2_.to(at::kDouble).contiguous().const_data_ptr<double>());
   auto first = vector(0);
   at::div_out(first, r_, residual2_.sqrt().clamp_min(space_.negligible()));
-  auto z = space_.vector(), w = at::Tensor();
+  auto z = space_.vector(), w = space_.vector();
   for (int64_t j = 0; j < m_; ++j) {
     if (space_.is_preconditioned()) space_.precondition(vector(j), z);
     space_.apply(space_.is_preconditioned() ? z : vector(j), w);
-    orthogonalise(j, w.reshape({batch, -1, 1}));
+    if (!b.is_cpu()) {
+      orthogonalise_on_device(j, w.reshape({batch, -1, 1}));
+      continue;
+    }
+    batch_loops::orthogonalise(v_, j, space_.negligible(), w, h_);
+    if (!all_end_with(j)) continue;
+    v_ = v_.narrow(0, 0, j + 1);
+    return;
+  }
+}
+
+bool TensorGmres::all_end_with(int64_t j) {
+  take_column(j, h_.const_data_ptr<double>(), h_.stride(0));
+  const auto ended = at::empty_like(residual2_);
+  for (int64_t s = 0; s < ended.numel(); ++s) {
+    const double value = cycles_[s].has_ended();
+    if (ended.scalar_type() == at::kFloat) ended.mutable_data_ptr<float>()[s] = static_cast<float>(value);
+    else ended.mutable_data_ptr<double>()[s] = value;
+  }
+  return space_.all_ended(ended);
+}
+
+void TensorGmres::begin_cycles(const double* residual2) {
+  cycles_.clear();
+  for (size_t s = 0; s < scale_.size(); ++s) {
+    cycles_.push_back({HessenbergProblem<HostNumbers>(numbers_, m_), std::sqrt(residual2[s])});
+    auto& problem = cycles_.back().problem;
+    problem.start(residual2[s], space_.enough2_of(static_cast<int64_t>(s)));
+    if (!is_first_) problem.leave_first();
+    problem.scale() = scale_[s];
+    problem.begin(cycles_.back().length);
+  }
+}
+
+void TensorGmres::take_column(int64_t j, const double* h, int64_t apart) {
+  for (auto& cycle : cycles_) {
+    if (!cycle.has_ended()) {
+      double* column = cycle.problem.column(cycle.columns);
+      double square = 0.0;
+      for (int64_t i = 0; i <= j + 1; ++i) {
+        column[i] = h[i * m_ + j];
+        square += column[i] * column[i];
+      }
+      cycle.problem.add_column(cycle.columns++, std::sqrt(square));
+    }
+    h += apart;
   }
 }
 
 /// w ← w - Σ h_ij v_i with h_ij = v_i·w, twice; v_{j+1} = w/‖w‖. A w that vanishes leaves the zero vector or noise, of
 /// which minimise() takes no heed.
-void TensorGmres::orthogonalise(int64_t j, const at::Tensor& w) {
+void TensorGmres::orthogonalise_on_device(int64_t j, const at::Tensor& w) {
   const auto basis = rows(j);
   const auto once = at::bmm(basis, w), rest = at::baddbmm(w, basis.mT(), once, 1, -1);
   const auto again = at::bmm(basis, rest), left = at::baddbmm(rest, basis.mT(), again, 1, -1);
@@ -117,37 +148,25 @@ void TensorGmres::orthogonalise(int64_t j, const at::Tensor& w) {
 }
 
 at::Tensor TensorGmres::minimise() {
-  const int64_t batch = h_.size(0), size = (m_ + 1) * m_;
-  const auto host = at::cat({h_.flatten(1), residual2_.flatten(1)}, 1).to(at::kCPU, at::kDouble);
-  auto y = at::zeros({batch, m_, 1}, at::kDouble), exhausted = at::empty({batch}, at::kDouble);
-  const HostNumbers numbers{2 * space_.epsilon(), space_.negligible()};
-  for (int64_t sample = 0; sample < batch; ++sample) {
-    const double* h = host.const_data_ptr<double>() + sample * (size + 1);
-    const double length = std::sqrt(h[size]);
-    HessenbergProblem problem(numbers, m_);
-    problem.start(h[size], space_.enough2_of(sample));
-    if (!is_first_) problem.leave_first();
-    problem.scale() = scale_[sample];
-    problem.begin(length);
-    int64_t columns = 0;
-    while (columns < m_ && !(columns > 0 && problem.ended(columns - 1) != 0.0)) {
-      double* column = problem.column(columns);
-      double square = 0.0;
-      for (int64_t i = 0; i <= columns + 1; ++i) {
-        column[i] = h[i * m_ + columns];
-        square += column[i] * column[i];
-      }
-      problem.add_column(columns++, std::sqrt(square));
-    }
-    problem.minimise(columns, length, 1.0);
-    for (int64_t j = 0; j < columns; ++j)
-      y.mutable_data_ptr<double>()[sample * m_ + j] = problem.inverse_length(j) == 0.0 ? 0.0 : problem.y(j);
-    scale_[sample] = problem.scale();
-    exhausted.mutable_data_ptr<double>()[sample] = problem.exhausted();
+  const int64_t batch = h_.size(0), size = (m_ + 1) * m_, columns = v_.size(0);
+  if (!h_.is_cpu()) {
+    const auto residual2 = residual2_.flatten().to(h_.scalar_type());
+    const auto host = at::cat({h_.flatten(), residual2}).to(at::kCPU, at::kDouble);
+    begin_cycles(host.const_data_ptr<double>() + batch * size);
+    for (int64_t j = 0; j < m_; ++j) take_column(j, host.const_data_ptr<double>(), size);
+  }
+  auto y = at::zeros({batch, columns, 1}, at::kDouble), exhausted = at::empty({batch}, at::kDouble);
+  for (int64_t s = 0; s < batch; ++s) {
+    auto& [problem, length, taken] = cycles_[s];
+    problem.minimise(taken, length, 1.0);
+    for (int64_t j = 0; j < taken; ++j)
+      y.mutable_data_ptr<double>()[s * columns + j] = problem.inverse_length(j) == 0.0 ? 0.0 : problem.y(j);
+    scale_[s] = problem.scale();
+    exhausted.mutable_data_ptr<double>()[s] = problem.exhausted();
   }
   is_first_ = false;
   exhausted_ = exhausted;
-  return y.to(h_.options());
+  return y;
 }
 
 }  // namespace prdp

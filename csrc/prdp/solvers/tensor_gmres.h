@@ -4,13 +4,33 @@
 #include <cstdint>
 #include <vector>
 
+#include "prdp/solvers/hessenberg_problem.h"
 #include "prdp/solvers/tensor_space.h"
 
 namespace prdp {
 
-/// GMRES(m) of a batch on another device: the cycles of GmresMethod, in a tenth of its operations. The basis is one
-/// tensor, and a pass of Gram–Schmidt two batched products; there are always two. The host solves the small problem of
-/// the cycle, in float64: it looks at the device once before the iterate moves, and once after.
+/// Numbers of one sample on the host, which vanish where those of its dtype would.
+struct HostNumbers {
+  using Scalar = double;
+  double epsilon, negligible;
+
+  template <class X>
+  std::vector<X> array(int64_t n) const {
+    return std::vector<X>(n);
+  }
+  double inverse(double value, double scale) const;
+  double larger(double a, double b) const { return a < b ? b : a; }
+  double is_larger(double a, double b) const { return a > b; }
+  double is_zero(double value) const { return value == 0.0; }
+  double is_not_zero(double value) const { return value != 0.0; }
+  bool surely_all(double value) const { return value != 0.0; }
+  void damp(const double* r, const double* g, int64_t n, double scale, double keep, double* y) const;
+};
+
+/// GMRES(m) of a batch that autograd does not record: the cycles of GmresMethod, in a tenth of its operations. The
+/// basis is one tensor. A pass of Gram–Schmidt, of which there are always two, is two batched products on a device, and
+/// loops on the CPU. The host solves the small problem of the cycle, in float64: it looks at a device once before the
+/// iterate moves, and once after.
 class TensorGmres {
  public:
   TensorGmres(TensorSpace& space, int64_t restart);
@@ -28,9 +48,22 @@ class TensorGmres {
  private:
   /// v₀ = r/‖r‖ and A M⁻¹ v_j = Σ h_ij v_i
   void extend_basis();
-  void orthogonalise(int64_t j, const at::Tensor& w);
-  /// y = argmin ‖r - A M⁻¹ V y‖, (batch, m, 1); sets `exhausted`.
+  void orthogonalise_on_device(int64_t j, const at::Tensor& w);
+  /// Whether the cycle is over for all samples, of which column j is known.
+  bool all_end_with(int64_t j);
+  /// y = argmin ‖r - A M⁻¹ V y‖, (batch, m, 1) in float64; sets `exhausted`.
   at::Tensor minimise();
+
+  /// The small problem of a sample.
+  struct Cycle {
+    HessenbergProblem<HostNumbers> problem;
+    double length;  // ‖r‖
+    int64_t columns = 0;
+    bool has_ended() const { return columns > 0 && problem.ended(columns - 1) != 0.0; }
+  };
+  void begin_cycles(const double* residual2);
+  /// Hands column j of every h, (m + 1, m) and `apart` numbers apart, to the cycles that go on.
+  void take_column(int64_t j, const double* h, int64_t apart);
   /// Row j of the basis, as a vector of the space.
   at::Tensor vector(int64_t j) const { return v_.select(0, j).view(space_.b().sizes()); }
   /// Rows 0 to j of each sample, (batch, j + 1, unknowns).
@@ -40,6 +73,8 @@ class TensorGmres {
   int64_t m_;
   at::Tensor r_, kept_x_, kept_r_, residual2_, exhausted_;
   at::Tensor v_, h_;           // (m, batch, unknowns) and (batch, m + 1, m), anew for each cycle
+  HostNumbers numbers_;
+  std::vector<Cycle> cycles_;  // of each sample
   std::vector<double> scale_;  // of each sample, the largest ‖A v‖ so far: what is rounding beside it is zero
   bool is_first_ = true;       // the next cycle
   bool ready_ = false;         // r_ and residual2_ belong to x
