@@ -300,14 +300,15 @@ def _fallback(rows: Sequence[Row], twin: Row | None, update: Update, seconds: fl
     best = update.fastest(rows, TOLERANCES[0])
     if best is not None:
         return (
-            f"Use {best.name} with rtol={loosest}, the fastest to it: no solver reaches {finest} within {seconds:g} s."
+            f"Use {best.name} with rtol={loosest}, the fastest to it: a search of {seconds:g} s found none that reaches "
+            f"{finest}."
         )
     is_single = rows[0].dtype == torch.float32
     stalled = [row.name for row in rows if is_single and row.status in ("STAGNATED", "BREAKDOWN")]
     other = f"try float64, as {listed(stalled)} stop at the rounding of float32; or " if stalled else ""
     return (
-        f"No solver reaches {loosest} within {seconds:g} s: {other}take a shorter time step or a smaller grid, or look "
-        "for a mistake with prdp.check_operator."
+        f"A search of {seconds:g} s found no solver that reaches {loosest}: {other}take a shorter time step or a "
+        "smaller grid, or look for a mistake with prdp.check_operator."
     )
 
 

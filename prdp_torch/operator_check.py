@@ -1,6 +1,6 @@
 """`check_operator`: whether an operator's parts agree with each other."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import torch
@@ -33,7 +33,7 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
     - every tensor that requires grad is among the tensors of the operator;
     - ⟨A v, w⟩ = ⟨v, Aᵀ w⟩;
     - the diagonal, if there is one, agrees with products with unit vectors (at most 256 of them);
-    - A maps its `nullspace` to zero, and the constant only if that is its `nullspace`;
+    - A maps its `nullspace` to zero, and A and Aᵀ the constant only if it is named;
     - the gradient of ⟨w, A v⟩ for each tensor agrees with finite differences in one random direction;
     - for `CG` and `MINRES` A is symmetric, and for `CG` definite, as far as 64 Lanczos steps tell where A has more than
       256 rows;
@@ -119,16 +119,20 @@ def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
         except ValueError as error:
             yield str(error).removeprefix(f"{type(A).__name__}: ")
         return
-    # Beside each row's own size: a row of one holds the constant, whatever stands in the others.
-    sizes = A.apply(v).abs()
 
-    def is_mapped_to_zero(constant: Tensor) -> bool:
-        product = A.apply(constant).abs()
+    def is_mapped_to_zero(constant: Tensor, by: Callable[[Tensor], Tensor] = A.apply) -> bool:
+        # Beside each row's own size: a row of one holds the constant, whatever stands in the others.
+        sizes, product = by(v).abs(), by(constant).abs()
         shares = torch.where(sizes > 0, product / sizes, product.ne(0).to(v.dtype))
         return bool((shares.flatten(1).square().mean(1).sqrt() <= 1e3 * torch.finfo(v.dtype).eps).any())
 
     ones = torch.ones_like(v)
     if not is_mapped_to_zero(ones):
+        if is_mapped_to_zero(ones, A.apply_transpose):
+            yield (
+                "A^T maps the constant to zero, so A is singular: give left_nullspace='constant' and, as nullspace, "
+                "the vector that A maps to zero"
+            )
         return
     shape = tuple(v.shape[1:])
     if len(shape) > 1 and shape[0] > 1:  # another constant in each channel

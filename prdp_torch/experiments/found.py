@@ -16,9 +16,9 @@ _SHOWN = ("converged", "direct", "auto", "prdp")  # kinds of rows
 
 
 def pictures(scene: _C.Scene, rows: list[Row], folder: Path) -> list[Drawn]:
-    """What the first seeds have found, whose θ lie beside their records in `folder`; nothing for a task with a network,
-    for a field in 3D, or where no θ is left."""
-    if scene.trains_network or len(scene.physics.shape) > 2:
+    """What the first seeds have found, whose θ lie beside their records in `folder`; of a field in 3D the plane in
+    the middle of its first axis. Nothing for a task with a network, or where no θ is left."""
+    if scene.trains_network:
         return []
     shown = [row for row in rows if row.kind in _SHOWN and "diverged" not in row.curves[0]]
     found = [(row, _found(scene, folder / row.label / "seed_0.json")) for row in shown]
@@ -33,8 +33,15 @@ def pictures(scene: _C.Scene, rows: list[Row], folder: Path) -> list[Drawn]:
     if reference.ndim == 1:
         cells = (np.arange(len(reference)) + 0.5) / len(reference)
         return [("found", _lines(reference, left, "x", cells, "κ"), "κ to be found, and found by the first seed.")]
-    caption = "κ to be found, found by the first seed, and below it the difference."
-    return [("found", _images(reference, left), caption)]
+    plane = " In the middle of the first axis." if reference.ndim == 3 else ""
+    caption = f"κ to be found, found by the first seed, and below it the difference.{plane}"
+    planes = [(row, _plane(values)) for row, values in left]
+    return [("found", _images(_plane(reference), planes), caption)]
+
+
+def _plane(values: np.ndarray) -> np.ndarray:
+    plane: np.ndarray = values[len(values) // 2] if values.ndim == 3 else values
+    return plane
 
 
 def _found(scene: _C.Scene, path: Path) -> np.ndarray | None:

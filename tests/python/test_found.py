@@ -67,7 +67,11 @@ def test_where_it_is_missing_the_training_is_run_again(tmp_path):
     assert compare.run_one(*arguments, resume=True)["metric"] == once["metric"] and kept.read_bytes() == before
 
 
-@pytest.mark.parametrize("make", [small_field, small_darcy, poisson])
+def in_3d(tmp_path):
+    return small_field(tmp_path, ("shape = [10, 12]", "shape = [4, 5, 6]"))
+
+
+@pytest.mark.parametrize("make", [small_field, small_darcy, poisson, in_3d])
 def test_the_report_shows_it(tmp_path, make):
     path = make(tmp_path)
     command = [sys.executable, "-m", "prdp_torch", "compare", path, "--seeds", "1", "--intervals", "3"]

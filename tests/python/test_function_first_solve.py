@@ -195,3 +195,19 @@ def test_inference_mode_names_a_tensor_that_autograd_cannot_record():
     for mode in (contextlib.nullcontext(), torch.inference_mode()):
         with mode, torch.enable_grad():
             assert torch.equal(handed_over.apply_transpose(b), weight * b)
+
+
+def test_a_slightly_nonlinear_product_is_told_by_its_residual(always):
+    """It is linear enough not to be refused, and its residual is that of another b."""
+    b = torch.randn(2, 1, 30, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    a = operators.Function(lambda v: 3 * v - 0.3 * torch.tanh(v.roll(1, -1)))
+    with pytest.warns(UserWarning, match=r"matvec is not linear: in sample \d, \|b - A u\| is 0.0"):
+        prdp.linear_solve(a, b, prdp.BiCGStab(100, rtol=1e-8))
+
+
+def test_a_linear_product_is_not():
+    b = torch.randn(2, 1, 30, generator=torch.Generator().manual_seed(0), dtype=torch.float32)
+    a = operators.Function(lambda v: 3 * v - v.roll(1, -1))
+    for scale in (1e-20, 1.0, 1e20):
+        prdp.linear_solve(a, scale * b, prdp.BiCGStab(100, rtol=1e-6))
+        prdp.linear_solve(a, scale * b, prdp.GMRES(100, restart=5, rtol=0.0), on_failure="return")

@@ -180,3 +180,16 @@ def test_a_nearly_singular_operator_that_takes_no_null_space_is_not_told_to_take
     A = operators.Diffusion(torch.ones(1, 4, 5, dtype=torch.float64), shift=1e-14, boundary="flux")
     with pytest.raises(ValueError, match="maps the constant to zero, so it is singular: enlarge the shift, or take a"):
         prdp.check_operator(A, example)
+
+
+def test_a_scheme_that_keeps_the_mean_is_singular_as_its_transpose_tells():
+    """Conservative upwind advection and diffusion on a ring: Aᵀ maps the constant to zero, and A another vector."""
+    n = 23
+    w = 1 + torch.randn(1, n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    left, d = w.roll(1, -1), 0.05 * n * n
+    centre = (w.clamp(min=0) - left.clamp(max=0)) * n + 2 * d
+    below, above = -left.clamp(min=0) * n - d, w.clamp(max=0) * n - d
+    a = operators.Stencil(torch.stack([centre, below, above], -2), [(0,), (-1,), (1,)], "periodic")
+    assert torch.linalg.svdvals(a.dense().reshape(n, n))[-1] < 1e-12
+    with pytest.raises(ValueError, match=r"A\^T maps the constant to zero, so A is singular: give left_nullspace="):
+        prdp.check_operator(a, torch.zeros(1, 1, n, dtype=torch.float64))

@@ -11,11 +11,13 @@
 #include "prdp/operators/function_checks.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/memory_check.h"
 #include "prdp/solvers/report_failures.h"
 #include "prdp/solvers/solve_on_gpu.h"
+#include "prdp/solvers/warnings.h"
 
 namespace prdp {
 
@@ -155,6 +157,29 @@ SolveOutputs autograd_op(const at::Tensor& b, Args... args) {
   return solve_and_differentiate_null_space(b, a, options, x0);
 }
 
+/// Warns where b - A u is not what the solve, which scales b, found: A of a Function is not linear.
+void warn_of_nonlinear_product(const OperatorSpec& a, const at::Tensor& b, const at::Tensor& u,
+                               const at::Tensor& residual) {
+  if (is_singular(a)) return;
+  const at::NoGradGuard no_grad;
+  auto constant = a;
+  constant.tensors = detached(a.tensors);
+  const auto left = sample_norms(b - make_operator(constant)->apply(u)) / sample_norms(b);
+  const auto known = residual.to(at::kDouble);
+  // Of a linear product the two are the same but for rounding. One by differences may differ a little.
+  constexpr double by_differences = 1e-3;
+  const auto wrong = (known < by_differences) & (left > 10.0 * known + by_differences) & left.isfinite();
+  if (!wrong.any().item<bool>()) return;
+  const auto worst = left.masked_fill(wrong.logical_not(), 0.0).argmax().item<int64_t>();
+  std::ostringstream key;
+  key << "nonlinear product " << products_of(a)->code.get();
+  warn_once(key.str(), left[worst].item<double>(), [&](std::ostringstream& text) {
+    text << "Function: " << product_name() << " is not linear: in sample " << worst << ", |b - A u| is "
+         << left[worst].item<double>() << " |b|, where the solve, of b scaled to the order of one, found "
+         << known[worst].item<double>();
+  });
+}
+
 }  // namespace
 
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
@@ -176,9 +201,10 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
   check_memory(options, b);
   const auto checks = checks_of(options.on_failure);
   a->check_parameters(gpu::may_run_kernel(b, options.solver) ? Checks::kHost : checks);
+  bool looks_at_product = false;
   if (!spec.transposed) {  // an adjoint solve follows one
     a->check_null_spaces(b);
-    if (is_function(spec)) refuse_nonlinear_product(spec, b);
+    looks_at_product = is_function(spec) && refuse_nonlinear_product(spec, b);
   }
   const auto& s = options.solver;
   auto rhs = b;
@@ -195,6 +221,7 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);
+  if (looks_at_product) warn_of_nonlinear_product(spec, b, result.u, info.residual);
   for (auto* part : info.parts())
     if (part->device() != b.device()) *part = part->to(b.device());
   return result;

@@ -95,12 +95,13 @@ void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b) {
                     "over in tensors");
 }
 
-void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
+bool refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
   const auto code = products_of(a)->code;
   const bool can_look = b.is_cpu() && b.numel() > 0 && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
-  if (!can_look) return;
+  if (!can_look) return false;
   const auto solves = static_cast<uint64_t>(code->solves) + 1;
-  if (std::has_single_bit(solves)) {
+  const bool looks = std::has_single_bit(solves);
+  if (looks) {
     const at::NoGradGuard no_grad;
     auto constant = a;
     constant.tensors = detached(a.tensors);
@@ -116,6 +117,7 @@ void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
     check_samples_are_apart(*of, v);
   }
   ++code->solves;
+  return looks;
 }
 
 }  // namespace prdp

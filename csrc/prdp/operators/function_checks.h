@@ -20,7 +20,7 @@ void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b);
 void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b);
 /// Raises ValueError where a solver would solve another problem than was meant: in the first solve on the CPU with this
 /// code, where A (-2 v) is not about -2 A v; in the 1st, 2nd, 4th, 8th, …, as what a function captures may change,
-/// where A 0 is no rounding beside b, or a sample changes another one.
-void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b);
+/// where A 0 is no rounding beside b, or a sample changes another one. Returns whether it looked.
+bool refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b);
 
 }  // namespace prdp

@@ -33,6 +33,10 @@ StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t
 
 namespace {
 bool is_allowed(double nu) { return std::isfinite(nu) && nu >= 0.0; }
+std::vector<double> numbers_of(const at::Tensor& nu) {
+  if (nu.dim() == 0) return {number_of(nu)};
+  return to_host<double>(nu.resolve_neg(), nu.numel());
+}
 }  // namespace
 
 void StepParameters::check_vector(const at::Tensor& b) const {
@@ -43,7 +47,7 @@ void StepParameters::check_values(Checks checks) const {
   if (checks == Checks::kHost && !nu.is_cpu()) return;
   if (checks == Checks::kShared && has_axis()) return;
   if (at::isTensorSubclassLike(nu)) return;  // no number yet; the solve checks it once there is one
-  const auto values = to_host<double>(nu, nu.numel());
+  const auto values = numbers_of(nu);
   for (size_t i = 0; i < values.size(); ++i)
     TORCH_CHECK_VALUE(is_allowed(values[i]), owner, ": nu must be finite and >= 0, got ", values[i],
                       has_axis() ? " in sample " + std::to_string(i) : "");
@@ -59,10 +63,9 @@ std::string StepParameters::refusal(int64_t sample) const {
 }
 
 std::vector<double> StepParameters::nu_values() const {
-  if (!has_axis()) return {number_of(nu)};
-  auto values = to_host<double>(nu, nu.size(0));
+  auto values = numbers_of(nu);
   for (auto& value : values)
-    if (!is_allowed(value)) value = std::numeric_limits<double>::quiet_NaN();
+    if (has_axis() && !is_allowed(value)) value = std::numeric_limits<double>::quiet_NaN();
   return values;
 }
 
