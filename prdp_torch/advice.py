@@ -300,8 +300,8 @@ def _fallback(rows: Sequence[Row], twin: Row | None, update: Update, seconds: fl
     best = update.fastest(rows, TOLERANCES[0])
     if best is not None:
         return (
-            f"Use {best.name} with rtol={loosest}, the fastest to it: a search of {seconds:g} s found none that reaches "
-            f"{finest}."
+            f"Use {best.name} with rtol={loosest}, the fastest to it: a search of {seconds:g} s found none "
+            f"that reaches {finest}."
         )
     is_single = rows[0].dtype == torch.float32
     stalled = [row.name for row in rows if is_single and row.status in ("STAGNATED", "BREAKDOWN")]
