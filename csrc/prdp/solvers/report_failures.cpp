@@ -60,7 +60,10 @@ struct Report {
   /// What tells a warning about one kind of solve from another.
   std::string key() const {
     const auto& solver = role.solver;
-    return who() + std::string(name(solver.method)) + " " + solver.preconditioner.spec().kind + " " + role.a.kind;
+    std::ostringstream text;
+    text << who() << name(solver.method) << ' ' << solver.preconditioner.spec().kind << ' ' << role.a.kind << ' '
+         << b.sizes().slice(1);  // another grid is another problem
+    return text.str();
   }
   /// "linear_solve: 2 of 8 samples", what `say` writes of one of them, and why it ended so; once.
   template <class Say>
