@@ -91,7 +91,7 @@ def _fold(
             t = t.unsqueeze(int(is_mapped))  # has no batch axis: it is that of the only sample
         of_samples = t.dim() - is_mapped == n and n > 0
         if is_mapped:
-            if n == 1 and t.dim() == 1:  # nu
+            if n == 1 and t.dim() == 1:  # a number for all, such as nu, becomes one for each
                 t, of_samples = t[:, None].expand(size, batch), True
             if not of_samples or t.shape[1] != batch or (n == 1 and t.dtype != like.dtype):
                 return None

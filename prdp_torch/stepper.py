@@ -38,6 +38,13 @@ def _make(call: _Call, u: Tensor) -> Tensor:
     return call.stepper(u)
 
 
+def _take_over(context: contextvars.Context) -> None:
+    """What the call has set for itself stays, as after any other call."""
+    for variable, value in context.items():
+        if variable is not _call and variable.get(None) is not value:
+            variable.set(value)
+
+
 class Stepper(HasSettings):
     """The base of all steppers. A stepper maps a state u to the next one by solving A(u) u_next = b(u).
 
@@ -173,7 +180,9 @@ class Stepper(HasSettings):
             )
         if not torch.compiler.is_compiling():
             call = _Call(self, log, _call.get())
-            state = contextvars.copy_context().run(_make, call, u)
+            context = contextvars.copy_context()
+            state = context.run(_make, call, u)
+            _take_over(context)
             return state, *(() if call.info is None else call.info[:5])
         own = self._adjoint_log
         self._adjoint_log, self.info, self._is_rolling_out = log, None, True

@@ -70,9 +70,9 @@ def load_trained(run_folder: str | Path, seed: int = 0, device: str | torch.devi
     scene = placed(records.scene_of(path, record), device)
     if not scene.trains_network:
         kept = records.weights_of(path)
-        raise ValueError(
-            f"load_trained: the scene '{scene.name}' trains no network; torch.load('{kept}')['theta'] is what it found"
-        )
+        of_field = ".exp()" if scene.task == "field" else ""
+        found = f"torch.load('{kept}')['theta']{of_field} is what it found" if kept.exists() else f"read '{path}'"
+        raise ValueError(f"load_trained: the scene '{scene.name}' trains no network; {found}")
     if "diverged" in record["curves"]:
         raise ValueError(f"load_trained: the training of '{path}' diverged, {record['curves']['diverged']}")
     network = records.read_weights(path, make_network(scene, seed, without_memory=True), record)

@@ -156,7 +156,7 @@ def train(
         if not callable(callback):
             raise TypeError(f"train: callbacks must be functions of an Interval, got {callback!r}")
     if not scene.trains_network and (data is not None or not isinstance(network, Theta | None)):
-        raise ValueError(f"train: the task '{scene.task}' trains no network: it takes neither data nor network")
+        raise ValueError(f"train: the task '{scene.task}' trains no network: it takes no data, and as network a Theta")
     if checkpoint is not None and isinstance(network, torch.nn.Module):
         check_tensors(network)
     found = [] if checkpoint is None else checkpoint.found()

@@ -190,7 +190,7 @@ def test_data_that_does_not_fit_is_refused_in_words(tmp_path, own, kind, message
 def test_data_is_refused_where_no_network_is_trained():
     scene = scenes.load("poisson_1p")
     for own in ({"data": torch.zeros(1)}, {"network": torch.nn.Linear(3, 3)}):
-        with pytest.raises(ValueError, match="the task 'parameters' trains no network: it takes neither data nor"):
+        with pytest.raises(ValueError, match="the task 'parameters' trains no network: it takes no data, and as"):
             train(scene, Refinement.constant(3), **own)
 
 

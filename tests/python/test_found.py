@@ -52,7 +52,7 @@ def test_a_training_leaves_it_in_a_theta(tmp_path):
     curves = train(scene, Refinement.constant(4), network=theta)
     assert error_of(scene, theta.theta.detach()) == pytest.approx(curves["metric"][-1], rel=1e-6)
     assert train(scene, Refinement.constant(4)) | {"seconds": 0} == curves | {"seconds": 0}
-    with pytest.raises(ValueError, match="the task 'field' trains no network: it takes neither data nor network"):
+    with pytest.raises(ValueError, match="the task 'field' trains no network: it takes no data, and as network a"):
         train(scene, Refinement.constant(4), network=torch.nn.Linear(2, 2))
 
 

@@ -198,7 +198,7 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
 SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
                                     const at::Tensor& x0) {
   const auto a = checked_operator(spec, b, options, x0);
-  check_memory(options, b);
+  check_memory(options, b, is_function(spec) || options.solver.preconditioner.is_operator());
   const auto checks = checks_of(options.on_failure);
   a->check_parameters(gpu::may_run_kernel(b, options.solver) ? Checks::kHost : checks);
   bool looks_at_product = false;

@@ -20,7 +20,7 @@ struct StepParameters {
   void check_vector(const at::Tensor& b) const;
   /// Raises ValueError unless nu is finite and >= 0.
   void check_values(Checks checks) const;
-  /// Why a sample is refused, as Operator::refusal(), and where its nu is not finite.
+  /// Why a sample is refused, as Operator::refusal().
   std::string refusal(int64_t sample) const;
 
   /// Whether samples may differ in nu.

@@ -27,6 +27,7 @@ const T* numbers(const at::Tensor& t, const at::Tensor& v) {
 /// The memory of v, which nobody else refers to from here on.
 template <class T>
 T* own(at::Tensor& v) {
+  TORCH_INTERNAL_ASSERT(v.is_contiguous());
   if (v.use_count() > 1 || v.storage().use_count() > 1) v = v.clone(at::MemoryFormat::Contiguous);
   return v.mutable_data_ptr<T>();
 }
@@ -145,35 +146,17 @@ at::Tensor update_iterate_and_residual(const Scalar& alpha, const Vector& p, con
   return rr;
 }
 
-void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) {
-  for (int64_t i = 0; i < count; ++i) h[i] = numbers_like(w);
-  with_type(w, [&]<class T>(T) {
-    const T *from = data<T>(w), *times = numbers<T>(factor, w);
-    for_each_sample(w, [&](int64_t s, int64_t at) {
-      std::vector<const T*> vectors(count);
-      std::vector<T> found(count);
-      for (int64_t i = 0; i < count; ++i) vectors[i] = data<T>(v[i]) + at;
-      AnyLength<T>().multi_dot(vectors.data(), count, times[s], from + at, found.data(), unknowns(w));
-      for (int64_t i = 0; i < count; ++i) h[i].template mutable_data_ptr<T>()[s] = found[i];
-    });
-  });
-}
-
-at::Tensor combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar* factor,
-                   Vector& w, const Active& active) {
-  auto square = numbers_like(w);
-  with_type(w, [&]<class T>(T) {
-    T *to = own<T>(w), *squares = square.mutable_data_ptr<T>();
-    for_each_sample(w, [&](int64_t s, int64_t at) {
+void add_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& x, const Active& active) {
+  with_type(x, [&]<class T>(T) {
+    T* to = own<T>(x);
+    for_each_sample(x, [&](int64_t s, int64_t at) {
       if (!goes_on(active, s)) return;
       std::vector<const T*> vectors(count);
       std::vector<T> weights(count);
-      for (int64_t i = 0; i < count; ++i) vectors[i] = data<T>(v[i]) + at, weights[i] = numbers<T>(h[i], w)[s];
-      squares[s] = AnyLength<T>().multi_axpy(static_cast<T>(sign), weights.data(), vectors.data(), count,
-                                             factor ? numbers<T>(*factor, w)[s] : T(1), to + at, unknowns(w));
+      for (int64_t i = 0; i < count; ++i) vectors[i] = data<T>(v[i]) + at, weights[i] = numbers<T>(h[i], x)[s];
+      AnyLength<T>().multi_axpy(T(1), weights.data(), vectors.data(), count, T(1), to + at, unknowns(x));
     });
   });
-  return square;
 }
 
 namespace {
@@ -186,25 +169,26 @@ std::vector<T*> rows_of(const at::Tensor& v, int64_t s, int64_t n) {
 }
 }  // namespace
 
-void orthogonalise(const at::Tensor& v, int64_t j, double least, Vector& w, const at::Tensor& h) {
+void orthogonalise(const at::Tensor& v, int64_t j, double least, Vector& w, const std::vector<double*>& h) {
   const int64_t m = v.size(0), n = unknowns(w);
   with_type(w, [&]<class T>(T) {
     T* const taken = own<T>(w);
     for_each_sample(w, [&](int64_t s, int64_t at) {
       const AnyLength<T> loops;
       const auto rows = rows_of<T>(v, s, n);
-      double* const column = h.mutable_data_ptr<double>() + s * (m + 1) * m + j;
+      if (h[s] == nullptr) {
+        if (j + 1 < m) std::fill_n(rows[j + 1], n, T(0));
+        return;
+      }
       std::vector<T> along(j + 1);
       T square = 0;
       for (int pass = 0; pass < 2; ++pass) {
         loops.multi_dot(rows.data(), j + 1, T(1), taken + at, along.data(), n);
         square = loops.multi_axpy(T(-1), along.data(), rows.data(), j + 1, T(1), taken + at, n);
-        for (int64_t i = 0; i <= j; ++i)
-          column[i * m] = static_cast<double>(along[i]) + (pass == 0 ? 0.0 : column[i * m]);
+        for (int64_t i = 0; i <= j; ++i) h[s][i] = static_cast<double>(along[i]) + (pass == 0 ? 0.0 : h[s][i]);
       }
-      const double length = std::sqrt(static_cast<double>(square));
-      column[(j + 1) * m] = length;
-      if (j + 1 < m) loops.scale(static_cast<T>(1.0 / std::max(length, least)), taken + at, rows[j + 1], n);
+      h[s][j + 1] = std::sqrt(static_cast<double>(square));
+      if (j + 1 < m) loops.scale(static_cast<T>(1.0 / std::max(h[s][j + 1], least)), taken + at, rows[j + 1], n);
     });
   });
 }

@@ -30,15 +30,12 @@ void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active);
 /// x += alpha p and r -= alpha q; returns ‖r‖².
 Scalar update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r,
                                    const Active& active);
-/// h_i = v_i·(factor w) for the first `count` of v.
-void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h);
-/// w = factor w + sign Σ h_i v_i; returns ‖w‖². Without a factor, w keeps its length.
-Scalar combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar* factor,
-               Vector& w, const Active& active);
-
-/// A step of Gram–Schmidt, twice: h_ij = v_i·w for i ≤ j, and w ← w - Σ h_ij v_i; then h_{j+1,j} = ‖w‖, and v_{j+1} =
-/// w/max(‖w‖, least) if there is such a row. v: (m, batch, …); h: (batch, m + 1, m) in float64.
-void orthogonalise(const at::Tensor& v, int64_t j, double least, Vector& w, const at::Tensor& h);
+/// x += Σ h_i v_i over the first `count` of v.
+void add_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& x, const Active& active);
+/// A step of Gram–Schmidt, twice: h_i = v_i·w for i ≤ j, and w ← w - Σ h_i v_i; then h_{j+1} = ‖w‖, and v_{j+1} =
+/// w/max(‖w‖, least) if there is such a row. v: (m, batch, …); h: j + 2 numbers of each sample, null where v_{j+1}
+/// shall be zero.
+void orthogonalise(const at::Tensor& v, int64_t j, double least, Vector& w, const std::vector<double*>& h);
 /// Σ y_i v_i, for y (batch, m, 1) in float64.
 Vector combination(const at::Tensor& v, const at::Tensor& y);
 

@@ -43,7 +43,7 @@ void TensorGmres::step() {
   kept_r_ = r_;
   extend_basis();
   const auto y = minimise();
-  at::Tensor d = space_.b().is_cpu() ? batch_loops::combination(v_, y) : at::bmm(rows(m_ - 1).mT(), y.to(h_.options()));
+  at::Tensor d = space_.in_loops() ? batch_loops::combination(v_, y) : at::bmm(rows(m_ - 1).mT(), y.to(h_.options()));
   d = d.view(space_.b().sizes());
   if (space_.is_preconditioned()) {
     auto z = space_.vector();
@@ -76,32 +76,31 @@ void TensorGmres::extend_basis() {
   const auto& b = space_.b();
   const int64_t batch = b.size(0);
   v_ = at::empty({m_, batch, space_.unknowns()}, b.options());  // a Function may keep what it was given before
-  h_ = at::zeros({batch, m_ + 1, m_}, b.is_cpu() ? b.options().dtype(at::kDouble) : b.options());
-  if (b.is_cpu()) begin_cycles(residual2_.to(at::kDouble).contiguous().const_data_ptr<double>());
+  if (space_.in_loops()) begin_cycles(residual2_.to(at::kDouble).contiguous().const_data_ptr<double>());
+  else h_ = at::zeros({batch, m_ + 1, m_}, b.options());
   auto first = vector(0);
   at::div_out(first, r_, residual2_.sqrt().clamp_min(space_.negligible()));
   auto z = space_.vector(), w = space_.vector();
   for (int64_t j = 0; j < m_; ++j) {
     if (space_.is_preconditioned()) space_.precondition(vector(j), z);
     space_.apply(space_.is_preconditioned() ? z : vector(j), w);
-    if (!b.is_cpu()) {
+    if (!space_.in_loops()) {
       orthogonalise_on_device(j, w.reshape({batch, -1, 1}));
-      continue;
+    } else if (orthogonalise_in_loops(j, w)) {
+      v_ = v_.narrow(0, 0, j + 1);
+      return;
     }
-    batch_loops::orthogonalise(v_, j, space_.negligible(), w, h_);
-    if (!all_end_with(j)) continue;
-    v_ = v_.narrow(0, 0, j + 1);
-    return;
   }
 }
 
-bool TensorGmres::all_end_with(int64_t j) {
-  take_column(j, h_.const_data_ptr<double>(), h_.stride(0));
-  const auto ended = at::empty_like(residual2_);
-  for (int64_t s = 0; s < ended.numel(); ++s) {
-    const double value = cycles_[s].has_ended();
-    if (ended.scalar_type() == at::kFloat) ended.mutable_data_ptr<float>()[s] = static_cast<float>(value);
-    else ended.mutable_data_ptr<double>()[s] = value;
+bool TensorGmres::orthogonalise_in_loops(int64_t j, at::Tensor& w) {
+  std::vector<double*> columns;
+  for (auto& cycle : cycles_) columns.push_back(cycle.has_ended() ? nullptr : cycle.next_column());
+  batch_loops::orthogonalise(v_, j, space_.negligible(), w, columns);
+  std::vector<bool> ended;
+  for (auto& cycle : cycles_) {
+    if (!cycle.has_ended()) cycle.take_column();
+    ended.push_back(cycle.has_ended());
   }
   return space_.all_ended(ended);
 }
@@ -118,18 +117,24 @@ void TensorGmres::begin_cycles(const double* residual2) {
   }
 }
 
-void TensorGmres::take_column(int64_t j, const double* h, int64_t apart) {
+void TensorGmres::Cycle::take_column() {
+  double square = 0.0;
+  for (int64_t i = 0; i <= columns + 1; ++i) square += next_column()[i] * next_column()[i];
+  problem.add_column(columns, std::sqrt(square));
+  ++columns;
+}
+
+void TensorGmres::take_columns_from_device() {
+  const int64_t batch = h_.size(0), size = (m_ + 1) * m_;
+  const auto host = at::cat({h_.flatten(), residual2_.flatten().to(h_.scalar_type())}).to(at::kCPU, at::kDouble);
+  const double* h = host.const_data_ptr<double>();
+  begin_cycles(h + batch * size);
   for (auto& cycle : cycles_) {
-    if (!cycle.has_ended()) {
-      double* column = cycle.problem.column(cycle.columns);
-      double square = 0.0;
-      for (int64_t i = 0; i <= j + 1; ++i) {
-        column[i] = h[i * m_ + j];
-        square += column[i] * column[i];
-      }
-      cycle.problem.add_column(cycle.columns++, std::sqrt(square));
+    while (cycle.columns < m_ && !cycle.has_ended()) {
+      for (int64_t i = 0; i <= cycle.columns + 1; ++i) cycle.next_column()[i] = h[i * m_ + cycle.columns];
+      cycle.take_column();
     }
-    h += apart;
+    h += size;
   }
 }
 
@@ -148,13 +153,9 @@ void TensorGmres::orthogonalise_on_device(int64_t j, const at::Tensor& w) {
 }
 
 at::Tensor TensorGmres::minimise() {
-  const int64_t batch = h_.size(0), size = (m_ + 1) * m_, columns = v_.size(0);
-  if (!h_.is_cpu()) {
-    const auto residual2 = residual2_.flatten().to(h_.scalar_type());
-    const auto host = at::cat({h_.flatten(), residual2}).to(at::kCPU, at::kDouble);
-    begin_cycles(host.const_data_ptr<double>() + batch * size);
-    for (int64_t j = 0; j < m_; ++j) take_column(j, host.const_data_ptr<double>(), size);
-  }
+  if (!space_.in_loops()) take_columns_from_device();
+  const auto batch = std::ssize(cycles_);
+  const int64_t columns = v_.size(0);
   auto y = at::zeros({batch, columns, 1}, at::kDouble), exhausted = at::empty({batch}, at::kDouble);
   for (int64_t s = 0; s < batch; ++s) {
     auto& [problem, length, taken] = cycles_[s];

@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "prdp/kernels/whole_vectors.h"
 #include "prdp/solvers/hessenberg_problem.h"
 #include "prdp/solvers/tensor_space.h"
 
@@ -14,9 +15,10 @@ struct HostNumbers {
   using Scalar = double;
   double epsilon, negligible;
 
+  /// Memory that is not touched: few columns of many may come.
   template <class X>
-  std::vector<X> array(int64_t n) const {
-    return std::vector<X>(n);
+  kernels::Field<X> array(int64_t n) const {
+    return kernels::Field<X>(n);
   }
   double inverse(double value, double scale) const;
   double larger(double a, double b) const { return a < b ? b : a; }
@@ -49,8 +51,8 @@ class TensorGmres {
   /// v₀ = r/‖r‖ and A M⁻¹ v_j = Σ h_ij v_i
   void extend_basis();
   void orthogonalise_on_device(int64_t j, const at::Tensor& w);
-  /// Whether the cycle is over for all samples, of which column j is known.
-  bool all_end_with(int64_t j);
+  /// The same by loops; returns whether the cycle is over for all samples.
+  bool orthogonalise_in_loops(int64_t j, at::Tensor& w);
   /// y = argmin ‖r - A M⁻¹ V y‖, (batch, m, 1) in float64; sets `exhausted`.
   at::Tensor minimise();
 
@@ -60,10 +62,13 @@ class TensorGmres {
     double length;  // ‖r‖
     int64_t columns = 0;
     bool has_ended() const { return columns > 0 && problem.ended(columns - 1) != 0.0; }
+    double* next_column() { return problem.column(columns); }
+    /// Takes it, once it is filled.
+    void take_column();
   };
   void begin_cycles(const double* residual2);
-  /// Hands column j of every h, (m + 1, m) and `apart` numbers apart, to the cycles that go on.
-  void take_column(int64_t j, const double* h, int64_t apart);
+  /// The columns that a device has filled.
+  void take_columns_from_device();
   /// Row j of the basis, as a vector of the space.
   at::Tensor vector(int64_t j) const { return v_.select(0, j).view(space_.b().sizes()); }
   /// Rows 0 to j of each sample, (batch, j + 1, unknowns).
@@ -72,7 +77,8 @@ class TensorGmres {
   TensorSpace& space_;
   int64_t m_;
   at::Tensor r_, kept_x_, kept_r_, residual2_, exhausted_;
-  at::Tensor v_, h_;           // (m, batch, unknowns) and (batch, m + 1, m), anew for each cycle
+  at::Tensor v_;               // (m, batch, unknowns), anew for each cycle
+  at::Tensor h_;               // (batch, m + 1, m), on a device
   HostNumbers numbers_;
   std::vector<Cycle> cycles_;  // of each sample
   std::vector<double> scale_;  // of each sample, the largest ‖A v‖ so far: what is rounding beside it is zero

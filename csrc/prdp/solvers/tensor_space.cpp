@@ -12,7 +12,10 @@
 namespace prdp {
 
 TensorSpace::TensorSpace(System& system, at::Tensor b, States& states, bool recording)
-    : system_(system), b_(std::move(b)), states_(states), recording_(recording) {
+    : system_(system),
+      b_(recording || !b.is_cpu() ? std::move(b) : b.contiguous()),
+      states_(states),
+      recording_(recording) {
   in_loops_ = !recording_ && batch_loops::take(b_);
   b2_ = dot(b_, b_);
   negligible_ = limits_of(b_).least_normal / limits_of(b_).epsilon;
@@ -179,16 +182,18 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
 }
 
 bool TensorSpace::all_ended(const Scalar& ended) {
-  // Other devices would have to be waited for; later cycles seldom end. The basis goes on with zeros.
-  if (!ended.is_cpu() || std::any_of(states_.begin(), states_.end(), [](const auto& s) { return s.iterations > 0; }))
-    return false;
-  const auto rows = values_of(ended);
-  ended_.resize(rows.size());
+  if (!ended.is_cpu()) return false;  // it would have to be waited for
+  std::vector<bool> rows;
+  for (const double value : values_of(ended)) rows.push_back(value != 0.0);
+  return all_ended(rows);
+}
+
+bool TensorSpace::all_ended(const std::vector<bool>& ended) {
+  // Later cycles seldom end: the basis goes on with zeros.
+  if (std::any_of(states_.begin(), states_.end(), [](const auto& s) { return s.iterations > 0; })) return false;
+  ended_ = ended;
   bool all = true;
-  for (size_t i = 0; i < rows.size(); ++i) {
-    ended_[i] = rows[i] != 0.0;
-    all = all && (ended_[i] || !is_active(i));
-  }
+  for (size_t i = 0; i < ended.size(); ++i) all = all && (ended[i] || !is_active(i));
   return all;
 }
 

@@ -41,8 +41,8 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   TensorSpace(System& system, at::Tensor b, States& states, bool recording = false);
   /// Starts from x, which leaves r of b: from here on b() is r, and what the method looks for is added to x.
   void start_from(at::Tensor x, at::Tensor r);
-  /// Whether the tensors lie on a device and autograd records nothing.
-  bool is_unrecorded_on_device() const { return !b_.is_cpu() && !recording_; }
+  /// Whether batch_loops compute, on contiguous vectors.
+  bool in_loops() const { return in_loops_; }
   /// Squared norms below this are zero to the dtype.
   double negligible() const { return negligible_; }
 
@@ -138,6 +138,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   void damp(const Scalar* R, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep, Scalar* h) const;
   bool surely_all(const Scalar&) const { return false; }
   bool all_ended(const Scalar& ended);
+  bool all_ended(const std::vector<bool>& ended);
   Scalar constant(const Scalar& a) const { return a.detach(); }
   Scalar enough2() const;
   double enough2_of(int64_t sample) const { return states_[sample].enough2; }
@@ -208,7 +209,9 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) const;
   /// A CPU scalar in a solve on another device, such as the diagonal of a plain nu. It is passed as a number: as a
   /// tensor, torch would refuse or copy it.
-  bool is_number_of_host(const at::Tensor& t) const { return is_unrecorded_on_device() && t.is_cpu() && t.dim() == 0; }
+  bool is_number_of_host(const at::Tensor& t) const {
+    return !b_.is_cpu() && !recording_ && t.is_cpu() && t.dim() == 0;
+  }
 
   /// What is zero beside the product of two factors, by the squares of their norms.
   at::Tensor rounding_of(const Scalar& v2, const Scalar& w2) const;

@@ -9,21 +9,19 @@ namespace prdp {
 
 void TensorSpace::dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w,
                        Scalar* h) const {
-  if (in_loops_) return batch_loops::dots(v, count, factor, w, h);
   const auto scaled = factor * w.detach();
   for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i].detach(), scaled);
 }
 
 TensorSpace::Scalar TensorSpace::subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count,
                                                       const Scalar& factor, Vector& w) const {
-  if (in_loops_) return batch_loops::combine(-1.0, h, v, count, &factor, w, {});
   w = factor * w;
   for (int64_t i = 0; i < count; ++i) w = at::addcmul(w, h[i], v[i], -1);
   return dot(w.detach(), w.detach());
 }
 
 void TensorSpace::add_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& x) {
-  if (in_loops_) return void(batch_loops::combine(1.0, h, v, count, nullptr, x, active_));
+  if (in_loops_) return batch_loops::add_combination(h, v, count, x, active_);
   auto sum = x;
   for (int64_t i = 0; i < count; ++i) sum = at::addcmul(sum, h[i], v[i]);
   x = keep_frozen(sum, x);
