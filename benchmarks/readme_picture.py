@@ -5,6 +5,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from prdp_torch.experiments import _C, field_task, scenes
+from prdp_torch.experiments.networks import Theta
 from prdp_torch.experiments.refinement import Refinement
 
 WAYS = {  # label: colour, title
@@ -49,7 +50,7 @@ def _fields():
     scene = scenes.load("diffusion_inverse")
     stepper = scenes.make_stepper(scene)
     controller = Refinement.auto().attach([stepper])
-    task = field_task.make_task(scene, [stepper], seed=0)
+    task = field_task.make_task(scene, [stepper], seed=0, found=Theta(scene))
     for update in range(scene.training.intervals):
         list(task.updates(update))
         controller.step(task.error(task.metric()))

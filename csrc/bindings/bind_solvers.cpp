@@ -9,6 +9,7 @@
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/sum_over_axes.h"
+#include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/solvers/warnings.h"
 #include "prdp/steppers/stepper.h"
@@ -247,6 +248,7 @@ void bind_solvers(py::module_& m) {
         a.transposed = transposed;
         const auto result = [&] {
           const py::gil_scoped_release no_gil;
+          const batch_loops::Off no_loops;
           return solve_with_tensors(*make_operator(a), b,
                                     {.solver = {method_from_name(solver), max_iter, rtol, restart,
                                                 OperatorSpec{std::move(preconditioner), {}, {}, {}}},

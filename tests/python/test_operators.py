@@ -104,8 +104,10 @@ def test_operators_say_what_is_wrong():
         operators.Heat((30,), 1e-3, 0.0)
     with pytest.raises(ValueError, match=r"Heat: nu must be finite and >= 0, got nan"):
         operators.Heat((30,), float("nan"), 1.0)
-    with pytest.raises(ValueError, match=r"Heat: nu must be a number or a 0-dimensional tensor, got shape \[2\]"):
-        operators.Heat((30,), torch.ones(2), 1.0)
+    with pytest.raises(
+        ValueError, match=r"Heat: nu must be a number, a 0-dimensional tensor, or \(batch,\), one for each"
+    ):
+        operators.Heat((30,), torch.ones(2, 1), 1.0)
     with pytest.raises(ValueError, match=r"Poisson: shape must have 1, 2 or 3 extents, got \[1, 2, 3, 4\]"):
         operators.Poisson((1, 2, 3, 4))
     with pytest.raises(ValueError, match=r"Poisson: every extent of shape must be >= 1, got \[3, 0\]"):

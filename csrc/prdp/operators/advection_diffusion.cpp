@@ -59,7 +59,7 @@ at::Tensor AdvectionDiffusion::coefficients() const {
 
 AdvectionDiffusion::Gradients AdvectionDiffusion::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   const auto weight = beta_ * lambda;
-  Gradients gradients{{}, weight * laplacian(u, grid_)};
+  Gradients gradients{{}, -weight * laplacian(u, grid_)};
   const auto over_channels = [](const at::Tensor& t) { return t.sum(1, /*keepdim=*/true); };
   for (int64_t d = 0; d < grid_.dim(); ++d)
     gradients.winds.push_back(

@@ -32,7 +32,7 @@ class AdvectionDiffusion {
   /// that of u.
   struct Gradients {
     std::vector<AxisWinds> winds;
-    at::Tensor nu_terms;  // like u, whose sum is minus the derivative
+    at::Tensor nu_terms;  // like u, whose sum is the derivative
   };
   Gradients product_rule(const at::Tensor& lambda, const at::Tensor& u) const;
 

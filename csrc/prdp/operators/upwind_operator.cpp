@@ -31,7 +31,7 @@ at::Tensor UpwindOperator::as_winds(std::vector<at::Tensor> channels) const {
 
 std::vector<at::Tensor> UpwindOperator::gradients(const UpwindGradients& found) const {
   at::Tensor nu;
-  for (const auto& terms : found.nu_terms) add_to(nu, -step_.gradient(terms));
+  for (const auto& terms : found.nu_terms) add_to(nu, step_.gradient(terms));
   return {found.winds, nu};
 }
 

@@ -41,7 +41,7 @@ std::optional<UpwindGradients> products(const Grid& grid, const at::Tensor& wind
   if (!gpu::each_sample(out.device(), product_rule_body<T>("ViscosityProductRule", kHeader), of,
                         channels * of.pair.points, batch))
     return std::nullopt;
-  return UpwindGradients{out, {-sums}};
+  return UpwindGradients{out, {sums}};
 }
 
 }  // namespace

@@ -9,7 +9,7 @@ namespace prdp {
 /// ∂⟨λ, A u⟩ for the winds of Burgers or Navier-Stokes, like them, and for ν.
 struct UpwindGradients {
   at::Tensor winds;
-  std::vector<at::Tensor> nu_terms;  // each (batch, …), whose sums are minus the derivative
+  std::vector<at::Tensor> nu_terms;  // each (batch, …), whose sums are the derivative
 };
 /// One launch each on a GPU; nothing where there are no kernels.
 /// I + β (Γ - ν L) on every channel.

@@ -66,7 +66,7 @@ void add_differences(const Plane<T>& plane, int axis, T beta, const T* __restric
   });
 }
 
-/// β λ L u of one field.
+/// -β λ L u of one field.
 template <class T>
 void laplacian_terms(const Plane<T>& plane, T beta, const T* __restrict l, const T* __restrict v, T* __restrict out) {
   for (int64_t i = 0; i < plane.points(); ++i) out[i] = plane.laplacian_diagonal * v[i];
@@ -74,7 +74,7 @@ void laplacian_terms(const Plane<T>& plane, T beta, const T* __restrict l, const
     plane.each(axis, [=, per_dx2 = plane.per_dx2[axis]](int64_t before, int64_t i, int64_t after) {
       out[i] += (v[before] + v[after]) * per_dx2;
     });
-  for (int64_t i = 0; i < plane.points(); ++i) out[i] *= beta * l[i];
+  for (int64_t i = 0; i < plane.points(); ++i) out[i] *= -beta * l[i];
 }
 
 /// Samples that share their winds, (samples, channels, points) behind each other.

@@ -18,6 +18,13 @@ using Active = std::vector<bool>;
 
 /// Whether they can take vectors like b.
 bool take(const at::Tensor& b);
+/// While it exists, they take none on this thread: tests compare them with tensor operations.
+class Off {
+ public:
+  Off();
+  Off(const Off&) = delete;
+  ~Off();
+};
 
 Scalar dot(const Vector& a, const Vector& b);
 /// max |v| of each sample, (batch,); NaN or Inf if any entry is.
