@@ -24,7 +24,7 @@ StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t
   dt = spec.parameters[0];
   nu = spec.tensors.back();
   TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0.0, owner, ": dt must be finite and > 0, got ", dt);
-  TORCH_CHECK_VALUE(nu.dim() <= 1, owner,
+  TORCH_CHECK_VALUE(nu.defined() && nu.dim() <= 1, owner,
                     ": nu must be a number, a 0-dimensional tensor, or (batch,), one for each "
                     "sample, got shape ",
                     nu.sizes());
