@@ -66,17 +66,3 @@ def test_a_sample_that_has_ended_is_handed_zeros():
     torch.testing.assert_close(u, b / torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=b.dtype))
     assert info.operator_applications[0] < info.operator_applications[1]
     assert sum(bool((v[0] == 0).all() and (v[1] != 0).any()) for v in seen) >= 2
-
-
-def test_a_user_of_context_variables_keeps_them_in_a_rollout():
-    import contextvars
-
-    count = contextvars.ContextVar("count", default=0)
-
-    class Counting(prdp.Heat):
-        def forward(self, u):
-            count.set(count.get() + 1)
-            return super().forward(u)
-
-    Counting((8,), 0.1, 0.1, prdp.CG(9)).rollout(torch.rand(1, 1, 8), 3)
-    assert count.get() == 3

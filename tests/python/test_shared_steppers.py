@@ -1,5 +1,6 @@
 """Steppers that threads share, and steppers whose calls are interrupted: neither leaves a trace in the other calls."""
 
+import contextvars
 import random
 import signal
 import threading
@@ -103,3 +104,15 @@ def test_an_interrupt_leaves_the_old_nu_or_the_new_one(as_parameter):
     for _ in interrupts(change, seconds=2, longest=0.003):
         assert 0 <= float(torch.as_tensor(step.nu).detach()) <= 1 and step(u).isfinite().all()
         assert len(list(step.parameters())) == as_parameter
+
+
+def test_a_user_of_context_variables_keeps_them_in_a_rollout():
+    count = contextvars.ContextVar("count", default=0)
+
+    class Counting(prdp.Heat):
+        def forward(self, u):
+            count.set(count.get() + 1)
+            return super().forward(u)
+
+    Counting((8,), 0.1, 0.1, prdp.CG(9)).rollout(torch.rand(1, 1, 8), 3)
+    assert count.get() == 3

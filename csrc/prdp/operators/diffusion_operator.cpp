@@ -5,6 +5,7 @@
 #include <limits>
 
 #include "prdp/gpu/operator_view.h"
+#include "prdp/operators/sets_of_samples.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/step_parameters.h"
 #include "prdp/operators/sums_in_order.h"
@@ -140,7 +141,7 @@ void DiffusionOperator::add_rule_of_faces(int64_t axis, const at::Tensor& lambda
 
 std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   if (auto by_kernel = product_rule_by_kernel(lambda, u); !by_kernel.empty()) return by_kernel;
-  const bool on_loops = has_rule_on_loops(lambda, u);
+  const bool on_loops = has_product_rule_loops(lambda, u, kappa_);
   const auto shift_bar = like(shift_, over_channels(lambda, u));
   std::vector<at::Tensor> kappa_bars(per_axis_ ? dim() : 1), robin_bar;
   for (int64_t axis = 0; axis < dim(); ++axis) {

@@ -90,9 +90,8 @@ class DiffusionOperator final : public Operator {
   SideProducts side_product_rule(int64_t axis, size_t end, const at::Tensor& lambda, const at::Tensor& u) const;
   /// ∂⟨λ, A u⟩/∂κ along an axis, without its sides, added to what is there.
   void add_rule_of_faces(int64_t axis, const at::Tensor& lambda, const at::Tensor& u, at::Tensor& kappa_bar) const;
-  /// The same by loops on the CPU, with the sides but for Robin's, for the tensors that the first function says: a
-  /// row for each SetsOfSamples.
-  bool has_rule_on_loops(const at::Tensor& lambda, const at::Tensor& u) const;
+  /// The same by loops on the CPU, where has_product_rule_loops(), with the sides but for Robin's: a row for each of
+  /// SetsOfSamples.
   void add_rule_on_loops(int64_t axis, const at::Tensor& lambda, const at::Tensor& u, at::Tensor& kappa_bar) const;
   template <class T>
   void add_rule_of_axis(int64_t axis, const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& kappa_bar) const;

@@ -1,10 +1,7 @@
-#include <ATen/core/grad_mode.h>
-
 #include <algorithm>
 #include <vector>
 
 #include "prdp/operators/diffusion_operator.h"
-#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/sets_of_samples.h"
 
 /// The product rule of a Diffusion by loops on the CPU. They round as the tensor operations do, but where samples share
@@ -66,11 +63,6 @@ void add_at_zero_side(const AxisOfCells<T>& axis, int64_t first, const Fields<T>
 }
 
 }  // namespace
-
-bool DiffusionOperator::has_rule_on_loops(const at::Tensor& lambda, const at::Tensor& u) const {
-  return lambda.is_cpu() && !at::GradMode::is_enabled() && is_plain(lambda) && is_plain(u) && is_plain(kappa_) &&
-         lambda.numel() > 0;
-}
 
 template <class T>
 void DiffusionOperator::add_rule_of_axis(int64_t d, const at::Tensor& lambda, const at::Tensor& u,

@@ -1,9 +1,20 @@
 #pragma once
+#include <ATen/core/grad_mode.h>
+
 #include <algorithm>
 
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/threads/interruption.h"
 
+/// Product rules by loops on the CPU.
 namespace prdp {
+
+/// Whether there are some for these tensors, and for a field that A is made of: plain ones, which autograd does not
+/// record.
+inline bool has_product_rule_loops(const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& field) {
+  return lambda.is_cpu() && !at::GradMode::is_enabled() && is_plain(lambda) && is_plain(u) && is_plain(field) &&
+         lambda.numel() > 0;
+}
 
 /// The samples of a batch whose parts of a gradient add up at once: each alone where it has a field of its own; where
 /// all share one, a few in their order, whatever the threads.

@@ -1,12 +1,10 @@
 #include "prdp/operators/upwind_rule_loops.h"
 
 #include <ATen/Dispatch.h>
-#include <ATen/core/grad_mode.h>
 
 #include <algorithm>
 
 #include "prdp/gpu/device/upwind_product_rule.h"
-#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/sets_of_samples.h"
 
 namespace prdp {
@@ -162,16 +160,11 @@ UpwindGradients products(const Grid& grid, const at::Tensor& winds, T beta, int6
   return {sets.count > w.size(0) ? out.sum(0, /*keepdim=*/true) : out, terms.unbind()};
 }
 
-bool has_loops(const at::Tensor& winds, const at::Tensor& lambda, const at::Tensor& u) {
-  return lambda.is_cpu() && !at::GradMode::is_enabled() && is_plain(lambda) && is_plain(u) && is_plain(winds) &&
-         lambda.numel() > 0;
-}
-
 }  // namespace
 
 std::optional<UpwindGradients> burgers_rule_on_loops(const Grid& grid, const at::Tensor& winds, double beta,
                                                      const at::Tensor& lambda, const at::Tensor& u) {
-  if (!has_loops(winds, lambda, u)) return std::nullopt;
+  if (!has_product_rule_loops(lambda, u, winds)) return std::nullopt;
   return AT_DISPATCH_FLOATING_TYPES(u.scalar_type(), "burgers_rule_on_loops", [&] {
     using T = scalar_t;
     const int64_t channels = u.size(1);
@@ -186,7 +179,7 @@ std::optional<UpwindGradients> burgers_rule_on_loops(const Grid& grid, const at:
 
 std::optional<UpwindGradients> navier_stokes_rule_on_loops(const Grid& grid, const at::Tensor& winds,
                                                            const at::Tensor& lambda, const at::Tensor& u) {
-  if (!has_loops(winds, lambda, u)) return std::nullopt;
+  if (!has_product_rule_loops(lambda, u, winds)) return std::nullopt;
   return AT_DISPATCH_FLOATING_TYPES(u.scalar_type(), "navier_stokes_rule_on_loops", [&] {
     return products<scalar_t>(grid, winds, scalar_t(1), /*channels=*/2, /*at_once=*/1, lambda, u,
                               navier_stokes_winds<scalar_t>);

@@ -164,11 +164,11 @@ void add_combination(const Scalar* h, const std::vector<Vector>& v, int64_t coun
 }
 
 namespace {
-/// The rows of sample s of v, (m, batch, …).
+/// The first `count` rows of sample s of v, (m, batch, …).
 template <class T>
-std::vector<T*> rows_of(const at::Tensor& v, int64_t s, int64_t n) {
-  std::vector<T*> rows(v.size(0));
-  for (int64_t i = 0; i < v.size(0); ++i) rows[i] = v.mutable_data_ptr<T>() + (i * v.size(1) + s) * n;
+std::vector<T*> rows_of(const at::Tensor& v, int64_t s, int64_t n, int64_t count) {
+  std::vector<T*> rows(count);
+  for (int64_t i = 0; i < count; ++i) rows[i] = v.mutable_data_ptr<T>() + (i * v.size(1) + s) * n;
   return rows;
 }
 }  // namespace
@@ -179,7 +179,7 @@ void orthogonalise(const at::Tensor& v, int64_t j, double least, Vector& w, cons
     T* const taken = own<T>(w);
     for_each_sample(w, [&](int64_t s, int64_t at) {
       const AnyLength<T> loops;
-      const auto rows = rows_of<T>(v, s, n);
+      const auto rows = rows_of<T>(v, s, n, std::min(j + 2, m));
       if (h[s] == nullptr) {
         if (j + 1 < m) std::fill_n(rows[j + 1], n, T(0));
         return;
@@ -202,7 +202,7 @@ Vector combination(const at::Tensor& v, const at::Tensor& y) {
   with_type(v, [&]<class T>(T) {
     T* const to = sum.mutable_data_ptr<T>();
     for_each_sample(sum, [&](int64_t s, int64_t at) {
-      const auto rows = rows_of<T>(v, s, unknowns(sum));
+      const auto rows = rows_of<T>(v, s, unknowns(sum), v.size(0));
       const double* const mine = y.const_data_ptr<double>() + s * v.size(0);
       const std::vector<T> weights(mine, mine + v.size(0));
       AnyLength<T>().multi_axpy(T(1), weights.data(), rows.data(), v.size(0), T(1), to + at, unknowns(sum));
