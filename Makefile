@@ -28,6 +28,9 @@ demo: $(STAMPS)/configure
 	@echo "prdp: finding a field from snapshots, through a differentiable solver: one to two minutes"
 	OMP_NUM_THREADS=1 $(BIN)/prdp compare diffusion_inverse
 
+# A test that hangs ends the run, with its stack and its name.
+ENDS := --max-worker-restart 0 -o faulthandler_timeout=600 -o faulthandler_exit_on_timeout=true
+
 test: $(STAMPS)/configure
 	@echo "prdp: building library, trainer and tests (from scratch some 6 minutes on two cores)"
 	$(BIN)/cmake --build build --parallel $$(nproc)
@@ -37,8 +40,8 @@ test: $(STAMPS)/configure
 	find csrc tests benchmarks -name '*.h' -o -name '*.cpp' | xargs $(BIN)/clang-format --dry-run -Werror
 	[ ! -x $(BIN)/clang-tidy ] || $(MAKE) --no-print-directory tidy
 	$(BIN)/ctest --test-dir build --output-on-failure
-	OMP_NUM_THREADS=1 $(BIN)/pytest -m "not alone" --numprocesses auto --maxprocesses 8 --dist loadfile
-	$(BIN)/pytest -m alone
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m "not alone" --numprocesses auto --maxprocesses 8 --dist loadfile $(ENDS)
+	$(BIN)/pytest -m alone $(ENDS)
 
 # Without a GPU: NVRTC compiles for cards that are not there.
 kernels: $(STAMPS)/configure

@@ -1,6 +1,5 @@
 """Ctrl-C in a rollout of an own equation: KeyboardInterrupt and nothing else, wherever it comes."""
 
-import gc
 import signal
 import sys
 import time
@@ -9,15 +8,6 @@ import pytest
 import torch
 
 import prdp_torch as prdp
-
-
-@pytest.fixture
-def no_callbacks_of_the_collector():
-    """Python drops what they raise, and hypothesis has one."""
-    callbacks = gc.callbacks[:]
-    gc.callbacks.clear()
-    yield
-    gc.callbacks.extend(callbacks)
 
 
 def test_an_interruption_anywhere_in_a_rollout_is_never_ignored(monkeypatch, no_callbacks_of_the_collector):
