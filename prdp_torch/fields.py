@@ -20,23 +20,25 @@ _Y, _X = -2, -1
 
 
 def divergence(u: Tensor, length: Length = 1.0) -> Tensor:
-    """∂u₁/∂x + ∂u₂/∂y in the cell centres by forward differences: (batch, 1, Ny, Nx)."""
+    """∂u₁/∂x + ∂u₂/∂y of a periodic u in the cell centres by forward differences: (batch, 1, Ny, Nx). Where a
+    `Flow` has walls or open ends, take `Flow.divergence`."""
     u1, u2, _ = _velocity("divergence", u)
     ly, lx = _sides("divergence", length)
     return _forward(u1, _X, lx) + _forward(u2, _Y, ly)
 
 
 def curl(u: Tensor, length: Length = 1.0) -> Tensor:
-    """The vorticity ∂u₂/∂x - ∂u₁/∂y at the lower left corner of each cell by backward differences:
-    (batch, 1, Ny, Nx)."""
+    """The vorticity ∂u₂/∂x - ∂u₁/∂y of a periodic u at the lower left corner of each cell by backward differences:
+    (batch, 1, Ny, Nx). Where a `Flow` has walls or open ends, it is wrong in the first row or column."""
     u1, u2, _ = _velocity("curl", u)
     ly, lx = _sides("curl", length)
     return _backward(u2, _X, lx) - _backward(u1, _Y, ly)
 
 
 def project(u: Tensor, length: Length = 1.0) -> Tensor:
-    """Remove the divergence of a velocity: returns u - G φ, where D G φ = D u is solved by Fourier transform.
-    This is the nearest field without discrete divergence. The mean velocity and the pressure do not change."""
+    """Remove the divergence of a periodic velocity: returns u - G φ, where D G φ = D u is solved by Fourier transform.
+    This is the nearest field without discrete divergence. The mean velocity and the pressure do not change. Where a
+    `Flow` has walls or open ends, take `Flow.project`."""
     u1, u2, u = _velocity("project", u)
     ly, lx = _sides("project", length)
     ny, nx = u.shape[-2:]

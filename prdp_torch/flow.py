@@ -17,7 +17,7 @@ from prdp_torch.solvers import CG, Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
 
-Boundary: TypeAlias = Literal["periodic", "wall", "open"]
+Boundary: TypeAlias = Literal["periodic", "wall", "slip", "open"]
 VECTORS = {"force", "inflow"}
 # What may be set for the next steps.
 TENSORS = {"nu", *VECTORS, *flow_walls.NAMES.values()}
@@ -32,14 +32,16 @@ class Flow(HoldsTensors, Stepper):
 
     Args:
         shape: the cells, (Ny, Nx) or (Nz, Ny, Nx), at least 3 per axis.
-        nu: viscosity >= 0, length²/time. A 0-dimensional tensor gets a gradient. A Parameter becomes one of the module,
-            and another tensor a buffer. The same holds for `force`, `inflow` and `wall_velocity`.
+        nu: viscosity >= 0, length²/time: a number or a tensor, which gets a gradient: 0-dimensional, or (batch,), one
+            for each sample. A Parameter becomes one of the module, and another tensor a buffer. The same holds for
+            `force`, `inflow` and `wall_velocity`.
         dt: time step > 0. The advection needs dt Σ |u|/dx <= 1, or with central advection and implicit diffusion at
             most √(2 nu dt)/dx for the largest dx where that is larger, and with upwind advection and explicit
             diffusion at most 1 - nu dt Σ 2/dx²; a longer step raises an error.
         boundary: one for all axes, or one per axis in the order of `shape`.
             "periodic".
             "wall": no slip at both ends. The low face of the first cell lies on the wall.
+            "slip": the same without friction, as at a plane of symmetry or a calm surface.
             "open": `inflow` at the low end; at the high end pressure zero and no normal gradient. At most one axis.
         length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/N.
         obstacle: bool (*shape), True in solid cells. Their faces carry no velocity.

@@ -49,6 +49,12 @@ CASES = {  # shape, settings, and tensors that get a gradient beside u and nu
         {"nu": 0.02, "boundary": ("wall", "open", "periodic"), "diffusion": "explicit"},
         {"inflow": torch.tensor([0.1, 1.0, 0.2]), "lid": noise(2, 3, 4, 5) * ALONG[3]},
     ),
+    "slip": (PLANE, {"nu": 0.05, "boundary": ("slip", "open")}, {"inflow": noise(2, 2, 5, 1)}),
+    "slip, upwind": (
+        BOX,
+        {"nu": 0.02, "boundary": ("slip", "periodic", "slip"), "advection": "upwind"},
+        {"force": noise(2, 3, *BOX)},
+    ),
     "implicit box": (BOX, {"nu": 0.02, "boundary": ("wall", "wall", "periodic")}, {"force": noise(1, 3, *BOX)}),
 }
 

@@ -20,7 +20,7 @@ def solid(shape, *cells):
 BAD = {
     "one axis": ({"shape": (8,)}, ValueError, "shape must have 2 or 3 extents"),
     "few cells": ({"shape": (8, 2)}, ValueError, "every extent of shape must be >= 3, got [8, 2]"),
-    "misspelt boundary": ({"boundary": "walls"}, ValueError, "'periodic', 'wall' or 'open', got 'walls'"),
+    "misspelt boundary": ({"boundary": "walls"}, ValueError, "'periodic', 'wall', 'slip' or 'open', got 'walls'"),
     "boundaries": (
         {"boundary": ("wall",) * 3},
         ValueError,
@@ -30,7 +30,7 @@ BAD = {
     "length": ({"length": (1.0, 0.0)}, ValueError, "length must be finite and > 0, got 0"),
     "dt": ({"dt": 0.0}, ValueError, "dt must be finite and > 0, got 0"),
     "nu": ({"nu": -1.0}, ValueError, "nu must be finite and >= 0, got -1"),
-    "nu of a shape": ({"nu": torch.ones(2)}, ValueError, "0-dimensional tensor, got shape [2]"),
+    "nu of a shape": ({"nu": torch.ones(2, 1)}, ValueError, "of shape () or (batch or 1,), got [2, 1]"),
     "advection": ({"advection": "weno"}, ValueError, "advection must be 'central' or 'upwind', got 'weno'"),
     "diffusion": ({"diffusion": "none"}, ValueError, "diffusion must be 'implicit' or 'explicit', got 'none'"),
     "mask of another shape": ({"obstacle": solid((7, 8))}, ValueError, "the shape of the grid, [8, 6], got [7, 8]"),

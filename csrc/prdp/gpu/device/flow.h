@@ -32,7 +32,7 @@ struct FlowStart {
     const auto& grid = boundary.grid;
     const T courant = largest_of(team, grid.cells(), [&](int i) { return courant_at(s, grid.place(i)); });
     const T given = largest_of(team, grid.cells(), [&](int i) { return given_at(s, grid.place(i)); });
-    const bool slow = std::isfinite(courant) && courant <= static_cast<T>(limit.at(static_cast<double>(nu.value())));
+    const bool slow = std::isfinite(courant) && courant <= static_cast<T>(limit.at(static_cast<double>(nu.value(s))));
     const auto verdict = !std::isfinite(given) ? SolveStatus::kNonfiniteInput
                          : slow                ? SolveStatus{}
                                                : SolveStatus::kDiverged;
@@ -86,8 +86,8 @@ struct FlowTerms {
                        : kernels::advection_point<false>(of_c, of_w, own_step, step);
   }
   T quarter_dx(int axis) const { return static_cast<T>(0.25 / grid.dx[axis]); }
-  T diffusion(int axis) const {
-    return static_cast<T>(static_cast<double>(nu.value()) / (grid.dx[axis] * grid.dx[axis]));
+  T diffusion(int s, int axis) const {
+    return static_cast<T>(static_cast<double>(nu.value(s)) / (grid.dx[axis] * grid.dx[axis]));
   }
 };
 
@@ -106,11 +106,11 @@ struct FlowChange {
     T sum = 0;
     for (int a = grid.first_axis(); a < 3; ++a) {
       const auto read = terms.point(s, c, a, p);
-      sum += terms.upwind ? kernels::advected<true>(read, terms.diffusion(a), terms.quarter_dx(a))
-                          : kernels::advected<false>(read, terms.diffusion(a), terms.quarter_dx(a));
+      sum += terms.upwind ? kernels::advected<true>(read, terms.diffusion(s, a), terms.quarter_dx(a))
+                          : kernels::advected<false>(read, terms.diffusion(s, a), terms.quarter_dx(a));
     }
     if (terms.friction)
-      sum -= terms.nu.value() * terms.friction.at(s, c, p) *
+      sum -= terms.nu.value(s) * terms.friction.at(s, c, p) *
              terms.padded[(static_cast<int64_t>(s) * grid.dim + c) * grid.padded_cells() + grid.padded(p)];
     if (force) sum += force.at(s, c, p);
     if (terms.free) sum *= terms.free.at(s, c, p);
@@ -118,18 +118,19 @@ struct FlowChange {
   }
 };
 
-/// The coefficients of I - ν dt Δ for each of the patterns -Δ, (patterns, entries, cells): the point itself first.
+/// The coefficients of I - ν dt Δ for each of the patterns -Δ, (patterns, samples, entries, cells): the point itself
+/// first.
 template <class T>
 struct FlowDiffusionEntries {
   const T* patterns[3];
   FlowNumber<T> nu;
   double dt;
-  int entries, cells;
+  int samples, entries, cells;
   T* out;
 
   void operator()(int i) const {
-    const int of_pattern = entries * cells, at = i % of_pattern;
-    const T scaled = patterns[i / of_pattern][at] * (nu.value() * static_cast<T>(dt));
+    const int of_sample = entries * cells, at = i % of_sample, s = i / of_sample % samples;
+    const T scaled = patterns[i / of_sample / samples][at] * (nu.value(s) * static_cast<T>(dt));
     out[i] = at < cells ? scaled + T(1) : scaled;
   }
 };

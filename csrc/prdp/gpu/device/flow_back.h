@@ -17,7 +17,7 @@ struct FlowReverse {
   }
   kernels::AdvectionBars<T> bars(int s, int c, int axis, const FlowPlace& p) const {
     const auto read = terms.point(s, c, axis, p);
-    const T diffusion = terms.diffusion(axis), quarter_dx = terms.quarter_dx(axis), g = tendency_bar(s, c, p);
+    const T diffusion = terms.diffusion(s, axis), quarter_dx = terms.quarter_dx(axis), g = tendency_bar(s, c, p);
     return terms.upwind ? kernels::advected_back<true>(read, diffusion, quarter_dx, g)
                         : kernels::advected_back<false>(read, diffusion, quarter_dx, g);
   }
@@ -97,7 +97,7 @@ struct FlowStateBars {
   T of_velocity(int s, int c, const FlowPlace& p) const {
     const auto& terms = reverse.terms;
     T sum = velocity_bar.at(s, c, p) + reverse.with_ghosts(s, c, p, {true, true, true});
-    if (terms.friction) sum -= terms.nu.value() * (terms.friction.at(s, c, p) * reverse.tendency_bar(s, c, p));
+    if (terms.friction) sum -= terms.nu.value(s) * (terms.friction.at(s, c, p) * reverse.tendency_bar(s, c, p));
     return sum;
   }
 };
@@ -144,7 +144,7 @@ struct FlowViscosityBars {
       sum -= static_cast<double>(terms.friction.at(s, c, p) * reverse.tendency_bar(s, c, p)) *
              static_cast<double>(terms.point(s, c, 2 - c, p).here);
     if (!diffused) return sum;
-    const double bar = static_cast<double>(lambda.at(s, c, p)), nu = static_cast<double>(terms.nu.value());
+    const double bar = static_cast<double>(lambda.at(s, c, p)), nu = static_cast<double>(terms.nu.value(s));
     sum -= terms.dt * bar * of_pattern(grid, s, c, p);
     if (!balanced || nu <= largest_nu) return sum;
     double of_share = bar * static_cast<double>(balanced.at(s, c, p) - change.at(s, c, p));

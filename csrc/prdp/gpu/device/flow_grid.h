@@ -11,7 +11,7 @@
 namespace prdp::gpu {
 
 /// What is at the ends of an axis, as prdp::FlowBoundary counts.
-inline constexpr int kPeriodicEnds = 0, kWallEnds = 1, kOpenEnds = 2;
+inline constexpr int kPeriodicEnds = 0, kWallEnds = 1, kOpenEnds = 2, kSlipEnds = 3;
 
 /// Indices along z, y and x, from 0 on; -1 and n are ghosts.
 struct FlowPlace {
@@ -59,11 +59,13 @@ struct FlowGrid {
   }
 
   /// By what the value of channel c at the first or last cell of an axis becomes that of the ghost beyond it. A
-  /// velocity is zero on a wall, half a cell away, and that through the high wall lies on it.
+  /// velocity is zero on a wall, half a cell away, or has no gradient where it slips, and that through the high wall
+  /// lies on it.
   template <class T>
   T ghost_factor(int axis, bool high, int c) const {
-    if (ends[axis] == kWallEnds) return high && c == 2 - axis ? T(0) : T(-1);
-    return ends[axis] == kOpenEnds && !high ? T(-1) : T(1);
+    const bool is_wall = ends[axis] == kWallEnds, slips = ends[axis] == kSlipEnds;
+    if ((is_wall || slips) && high && c == 2 - axis) return T(0);
+    return is_wall || (ends[axis] == kOpenEnds && !high) ? T(-1) : T(1);
   }
 };
 
@@ -80,12 +82,13 @@ struct FlowField {
   }
 };
 
-/// A number of the device; of the host, where the first is null.
+/// A number of the device for all samples, or one for each; of the host, where the first is null.
 template <class T>
 struct FlowNumber {
   const T* of_device;
+  int64_t sample;  // the step from one to the next: 0, if all share it
   T of_host;
-  T value() const { return of_device ? *of_device : of_host; }
+  T value(int s) const { return of_device ? of_device[s * sample] : of_host; }
 };
 
 /// A velocity, and what the boundary makes of it.

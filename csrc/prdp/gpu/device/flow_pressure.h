@@ -37,8 +37,8 @@ template <class T>
 struct FlowShare {
   FlowNumber<T> nu;
   double largest_nu;
-  T value() const {
-    const T here = nu.value();
+  T value(int s) const {
+    const T here = nu.value(s);
     return static_cast<double>(here) > largest_nu ? static_cast<T>(largest_nu) / here : T(1);
   }
 };
@@ -98,7 +98,7 @@ struct FlowDivergence {
     const T inside = cells ? cells.at(s, 0, p) : T(1);
     sum *= inside;
     if (potential_bar && !(u.refused && u.refused[s] != 0)) sum += potential_bar.at(s, 0, p) * inside;
-    return sum * share.value();
+    return sum * share.value(s);
   }
 };
 
@@ -126,7 +126,7 @@ struct FlowCorrection {
     parts.without_means(team, n, phi + begin);
     if (potential)
       team.each(
-          n, [&](int i) { return share.value() * phi[begin + i] + (before ? before[begin + i] : T(0)); },
+          n, [&](int i) { return share.value(s) * phi[begin + i] + (before ? before[begin + i] : T(0)); },
           [&](int i, T value) { potential[begin + i] = value; });
     team.meet();
     for (int a = grid.first_axis(); a < 3; ++a) {
@@ -151,7 +151,7 @@ struct FlowCorrection {
     T gradient = kernels::difference(static_cast<T>(factor / grid.dx[axis]),
                                      grid.has(before_it) ? value(before_it) : T(0), value(p));
     if (u.free && !on_all_faces) gradient *= u.free.at(s, c, p);
-    return u.at(s, c, p) + share.value() * gradient;
+    return u.at(s, c, p) + share.value(s) * gradient;
   }
 };
 

@@ -19,6 +19,12 @@ bool is_incremental(const FlowEquation& e) {
          e.box->fields(e.nu.options()).free.defined();
 }
 
+/// The share of this pressure that is taken off, of all samples or of each; undefined: the whole of all.
+at::Tensor share_of_pressure(const FlowEquation& e) {
+  const double limit = largest_viscosity(e);
+  return e.largest_nu() <= limit ? at::Tensor() : limit / e.nu.clamp_min(limit);
+}
+
 }  // namespace
 
 double largest_viscosity(const FlowEquation& e) {
@@ -42,8 +48,8 @@ Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOp
     if (const auto found = project_by_kernels(*e.box, by, options, info)) return {found->u, found->potential};
   }
   auto whole = project(*e.box, change, options, info);
-  if (e.nu.item<double>() <= limit) return whole;
-  const auto share = limit / e.nu;
+  const auto share = share_of_pressure(e);
+  if (!share.defined()) return whole;
   return {at::lerp(change, whole.u, share), whole.potential * share};
 }
 
@@ -62,8 +68,8 @@ FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const a
   }
   const auto& free = e.box->fields(cotangent[0].options()).free;
   const auto given = joined(cotangent) * free;
-  if (e.nu.item<double>() <= limit) return {project_vjp(*e.box, given, potential_bar, {}, options, info).on_free_faces};
-  const auto share = limit / e.nu;
+  const auto share = share_of_pressure(e);
+  if (!share.defined()) return {project_vjp(*e.box, given, potential_bar, {}, options, info).on_free_faces};
   const auto of_whole = potential_bar.defined() ? potential_bar * share : potential_bar;
   return {given * (1.0 - share) + project_vjp(*e.box, given * share, of_whole, {}, options, info).on_free_faces};
 }
@@ -74,13 +80,14 @@ BalanceVjp balance_vjp(const FlowEquation& e, const FlowParts& cotangent, const 
                        const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
   if (!is_incremental(e)) return {cotangent, {}};
   BalanceVjp found{change_back(e, cotangent, potential_bar, options, info), {}};
-  const double limit = largest_viscosity(e);
-  if (!change.defined() || e.nu.item<double>() <= limit) return found;
+  const auto share = share_of_pressure(e);
+  if (!change.defined() || !share.defined()) return found;
   CombinedInfo again;
   const auto whole = project(*e.box, change, options, again);
-  auto of_share = (joined(cotangent) * (whole.u - change)).sum();
-  if (potential_bar.defined()) of_share = of_share + (potential_bar * whole.potential).sum();
-  found.nu = -of_share * (limit / e.nu) / e.nu;
+  auto of_share = e.nu_gradient(joined(cotangent) * (whole.u - change));
+  if (potential_bar.defined()) of_share = of_share + e.nu_gradient(potential_bar * whole.potential);
+  const double limit = largest_viscosity(e);
+  found.nu = at::where(e.nu > limit, -of_share * share / e.nu.clamp_min(limit), 0.0);
   return found;
 }
 

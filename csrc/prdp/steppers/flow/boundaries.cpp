@@ -116,7 +116,8 @@ at::Tensor diffusion_coefficients(const FlowBox& box, int64_t along, const at::T
       const double coupling = 1.0 / (box.dx(axis) * box.dx(axis));
       // A wall or an inlet along the face's own axis is a whole cell away, along the others half a cell.
       const bool outlet = box.boundary(axis) == FlowBoundary::kOpen && side > 0;
-      const double beyond = outlet ? 0.0 : axis == along ? 1.0 : 2.0;
+      const bool slips = box.boundary(axis) == FlowBoundary::kSlip && axis != along;
+      const double beyond = outlet || slips ? 0.0 : axis == along ? 1.0 : 2.0;
       const auto weight = neighbour(box, at::ones(box.shape(), at::kDouble), axis, side, beyond);
       const auto behind = axis == along ? at::zeros_like(weight) : neighbour(box, inside, axis, side, 0.0);
       diagonal = diagonal + coupling * (weight + behind) * free;
@@ -155,10 +156,13 @@ at::Tensor friction_coefficients(const FlowBox& box, const FaceMasks& faces) {
   return friction;
 }
 
-/// By what the velocity beside a high wall of this axis is multiplied beyond it, (d, 1, …): its own component is zero
-/// on the wall.
-at::Tensor signs_beyond_wall(const FlowBox& box, int64_t axis) {
-  auto signs = -at::ones(box.dim(), at::kDouble);
+/// By what the velocity beside a wall of this axis is multiplied beyond it.
+double sign_beyond_wall(const FlowBox& box, int64_t axis) {
+  return box.boundary(axis) == FlowBoundary::kSlip ? 1.0 : -1.0;
+}
+/// The same of a high wall, (d, 1, …): its own component is zero on the wall.
+at::Tensor signs_beyond_high_wall(const FlowBox& box, int64_t axis) {
+  auto signs = at::full({box.dim()}, sign_beyond_wall(box, axis), at::kDouble);
   signs[box.channel_of(axis)] = 0.0;
   std::vector<int64_t> shape(box.dim() + 1, 1);
   shape[0] = box.dim();
@@ -177,7 +181,10 @@ FlowFields make_flow_fields(const FlowBox& box) {
   TORCH_CHECK_VALUE(fluid.any().item<bool>(), "Flow: the obstacle fills the grid; at least one cell must be fluid");
   const auto faces = make_face_masks(box, fluid.to(at::kDouble));
   FlowFields fields;
-  for (int64_t axis = 0; axis < box.dim(); ++axis) fields.high_sign.push_back(signs_beyond_wall(box, axis));
+  for (int64_t axis = 0; axis < box.dim(); ++axis) {
+    fields.low_sign.push_back(sign_beyond_wall(box, axis));
+    fields.high_sign.push_back(signs_beyond_high_wall(box, axis));
+  }
   for (int64_t c = 0; c < box.dim(); ++c)
     fields.diffusion.push_back(diffusion_coefficients(box, box.dim() - 1 - c, faces.free[c], faces.inside[c]));
   auto given = fluid.logical_not();

@@ -27,7 +27,8 @@ std::vector<T> per_axis(const std::vector<T>& given, size_t axes, const char* wh
 FlowBoundary flow_boundary_from_name(const std::string& name) {
   if (name == "periodic") return FlowBoundary::kPeriodic;
   if (name == "wall") return FlowBoundary::kWall;
-  TORCH_CHECK_VALUE(name == "open", "Flow: boundary must be 'periodic', 'wall' or 'open', got '", name, "'");
+  if (name == "slip") return FlowBoundary::kSlip;
+  TORCH_CHECK_VALUE(name == "open", "Flow: boundary must be 'periodic', 'wall', 'slip' or 'open', got '", name, "'");
   return FlowBoundary::kOpen;
 }
 
@@ -63,8 +64,10 @@ int64_t FlowBox::open_axis() const {
 }
 
 bool FlowBox::is_held() const {
-  const auto holds = [](FlowBoundary boundary) { return boundary != FlowBoundary::kPeriodic; };
-  return obstacle_.defined() || std::any_of(boundary_.begin(), boundary_.end(), holds);
+  const auto holds = [](FlowBoundary b) { return b == FlowBoundary::kWall || b == FlowBoundary::kOpen; };
+  const auto is_closed = [](FlowBoundary b) { return b != FlowBoundary::kPeriodic; };
+  return obstacle_.defined() || std::any_of(boundary_.begin(), boundary_.end(), holds) ||
+         std::all_of(boundary_.begin(), boundary_.end(), is_closed);
 }
 
 double FlowBox::largest_dx() const {

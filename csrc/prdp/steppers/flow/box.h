@@ -18,8 +18,9 @@ enum class FlowBoundary {
   kPeriodic,
   kWall,  // no slip at both ends
   kOpen,  // the inflow at the low end; pressure zero and no normal gradient at the high end
+  kSlip,  // walls without friction at both ends: what is beyond them mirrors what is before
 };
-/// "periodic", "wall" or "open"; raises ValueError for other names.
+/// "periodic", "wall", "open" or "slip"; raises ValueError for other names.
 FlowBoundary flow_boundary_from_name(const std::string& name);
 
 /// What the equations of a flow know about the box, as tensors of one dtype and device. Undefined masks are 1
@@ -31,7 +32,8 @@ struct FlowFields {
   at::Tensor friction;                // (1, d, *shape): 1/dx² for each neighbour inside an obstacle; or undefined
   at::Tensor pressure;                // (1, 2 d + 1, *shape): coefficients of -dx² div grad
   std::vector<at::Tensor> diffusion;  // (1, 2 d + 1, *shape) for each component: -Δ; a single one if all are the same
-  std::vector<at::Tensor> high_sign;  // per axis, (d, 1, …): the ghost beyond its high wall is so many times the last
+  std::vector<double> low_sign;  // per axis: the ghost beyond its low wall is so many times the first
+  std::vector<at::Tensor> high_sign;  // per axis, (d, 1, …): that beyond its high wall is so many times the last
   /// (parts, *shape): 1 in the cells of each closed part of the fluid, where the pressure has no level; empty for one
   /// part of all cells, undefined if there are none.
   at::Tensor closed_parts;
@@ -56,7 +58,7 @@ class FlowBox {
   /// The axis with an inflow, or -1.
   int64_t open_axis() const;
   int64_t channel_of(int64_t axis) const { return dim() - 1 - axis; }
-  /// Whether walls, obstacles or an inflow hold the mean velocity.
+  /// Whether walls, obstacles or an inflow hold the mean velocity. Walls with slip hold that through them alone.
   bool is_held() const;
   double largest_dx() const;
   /// Σ_axes 2 / dx².

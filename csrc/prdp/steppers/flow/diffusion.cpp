@@ -1,6 +1,5 @@
 #include "prdp/steppers/flow/diffusion.h"
 
-#include "prdp/operators/sums_in_order.h"
 #include "prdp/steppers/flow/kernels.h"
 #include "prdp/steppers/flow/stencil_of.h"
 
@@ -12,7 +11,7 @@ std::vector<OperatorSpec> diffusion_operators(const FlowEquation& e, const at::T
   std::vector<OperatorSpec> operators;
   for (size_t k = 0; k < patterns.size(); ++k) {
     if (made.defined()) {
-      operators.push_back(stencil_of(*e.box, made.narrow(0, static_cast<int64_t>(k), 1)));
+      operators.push_back(stencil_of(*e.box, made[static_cast<int64_t>(k)]));
       continue;
     }
     const auto scaled = patterns[k] * (e.nu * e.dt);
@@ -49,7 +48,7 @@ DiffuseVjp diffuse_vjp(const FlowEquation& equation, const std::vector<OperatorS
     const auto found = counted_adjoint_solve(operators[k], of_system(cotangent), of_system(result), options, info);
     parts.push_back(found.b);
     if (!found.coefficients.defined()) continue;
-    const auto share = total(found.coefficients * patterns[k]) * equation.dt;
+    const auto share = equation.nu_gradient(found.coefficients * patterns[k]) * equation.dt;
     nu = nu.defined() ? nu + share : share;
   }
   if (!flow_kernels::can_run(cotangent)) parts = {joined(parts)};

@@ -1,11 +1,14 @@
 #include "prdp/steppers/flow/equation.h"
 
+#include <ATen/ExpandUtils.h>
 #include <ATen/TracerMode.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "prdp/error_text.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/steppers/flow/kernels.h"
 
 namespace prdp {
@@ -56,15 +59,26 @@ void check_wall(const FlowBox& box, size_t i, const at::Tensor& velocity) {
                     box.channel_of(axis), " must be 0");
 }
 
-/// (d,) → (1, d, 1, …).
-at::Tensor with_all_axes(at::Tensor t, const at::Tensor& u) {
+/// Of one axis, which becomes the axis `place` of a state's: (d,) → (1, d, 1, …).
+at::Tensor with_all_axes(at::Tensor t, const at::Tensor& u, int64_t place = 1) {
   if (!t.defined()) return t;
   if (t.dim() == 1) {
     std::vector<int64_t> sizes(u.dim(), 1);
-    sizes[1] = t.size(0);
+    sizes[place] = t.size(0);
     t = t.reshape(sizes);
   }
   return t.to(u.options());
+}
+
+/// Returns the largest nu. Raises ValueError for one that is out of range.
+double check_nu(const FlowEquation& e) {
+  TORCH_CHECK_VALUE(e.nu.dim() <= 1, "Flow: nu must be a number, or a tensor of shape () or (batch or 1,), got ",
+                    e.nu.sizes());
+  const auto values = e.nu_values();
+  for (size_t i = 0; i < values.size(); ++i)
+    TORCH_CHECK_VALUE(std::isfinite(values[i]) && values[i] >= 0, "Flow: nu must be finite and >= 0, got ", values[i],
+                      e.nu.dim() == 0 ? "" : c10::str(" at index ", i));
+  return e.largest_nu();
 }
 
 }  // namespace
@@ -98,10 +112,7 @@ double FlowEquation::check() const {
     TORCH_CHECK_VALUE(!t.defined() || !t.is_meta(), "Flow: a tensor of it is on meta, where it has no values: give it ",
                       "some, as with to_empty and load_state_dict");
   TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0, "Flow: dt must be finite and > 0, got ", dt);
-  TORCH_CHECK_VALUE(nu.dim() == 0, "Flow: nu must be a number or a 0-dimensional tensor, got shape ", nu.sizes());
-  const double value = nu.item<double>();
-  TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0, "Flow: nu must be finite and >= 0, got ", value);
-  const double number = value * dt * box->sum_of_couplings();
+  const double number = check_nu(*this) * dt * box->sum_of_couplings();
   TORCH_CHECK_VALUE(is_diffused_implicitly() || number <= 1 + 1e-6,
                     "Flow: explicit diffusion needs nu dt Σ 2/dx² <= 1, got ", number, "; take a smaller dt or ",
                     in_language("diffusion='implicit'", "FlowDiffusion::kImplicit"));
@@ -125,10 +136,14 @@ double FlowEquation::check(const at::Tensor& u) const {
   TORCH_CHECK_NOT_IMPLEMENTED(!any_tangent(all), "Flow: takes no dual tensors of forward mode; use autograd.grad");
   const double number = check();
   box->check_velocity(u);
-  const auto check_batch = [&](const std::string& name, const at::Tensor& t) {
-    TORCH_CHECK_VALUE(!t.defined() || t.dim() == 1 || t.size(0) == 1 || t.size(0) == u.size(0), "Flow: ", name,
-                      " holds ", t.size(0), " samples, u holds ", u.size(0));
+  const auto check_samples = [&](const std::string& name, int64_t samples) {
+    TORCH_CHECK_VALUE(samples == 1 || samples == u.size(0), "Flow: ", name, " holds ", samples, " samples, u holds ",
+                      u.size(0));
   };
+  const auto check_batch = [&](const std::string& name, const at::Tensor& t) {
+    if (t.defined() && t.dim() > 1) check_samples(name, t.size(0));
+  };
+  if (nu.dim() == 1) check_samples("nu", nu.size(0));
   check_batch("force", force);
   check_batch("inflow", inflow);
   for (size_t i = 0; i < wall_velocity.size(); ++i) check_batch(name_of_wall(i), wall_velocity[i]);
@@ -139,22 +154,44 @@ void FlowEquation::check_steps(const at::Tensor& u, int64_t steps) const {
   const double number = check(u);
   constexpr double most = 1e6;  // beyond, 1 is rounding beside the coefficients of I - nu dt Δ
   const bool is_unaffected = steps == 0 || !is_diffused_implicitly() || u.scalar_type() == at::kDouble;
-  TORCH_CHECK_VALUE(number <= most || is_unaffected || box->is_held(),
-                    "Flow: float32 loses the mean velocity of a periodic box where nu dt Σ 2/dx² > ", most, ", got ",
-                    number, "; take float64 or a smaller dt");
+  TORCH_CHECK_VALUE(
+      number <= most || is_unaffected || box->is_held(),
+      "Flow: float32 loses the mean velocity of a periodic box, or along walls with slip, where nu dt Σ 2/dx² > ", most,
+      ", got ", number, "; take float64 or a smaller dt");
 }
 
 FlowEquation FlowEquation::for_state(const at::Tensor& u) const {
   auto all = tensors();
   // Kernels take a number of the host as it is: a copy would make the host wait.
-  const bool stays = nu.is_cpu() && flow_kernels::can_run(u);
-  all[kNu] = stays ? nu.to(u.scalar_type()) : nu.to(u.options());
+  const bool stays = nu.is_cpu() && nu.dim() == 0 && flow_kernels::can_run(u);
+  all[kNu] = stays ? nu.to(u.scalar_type()) : with_all_axes(nu, u, /*place=*/0);
   for (size_t i = kForce; i < all.size(); ++i) {
     if (i >= kFirstWall && all[i].defined() && all[i].dim() > 1)
       all[i] = all[i].unsqueeze(2 + static_cast<int64_t>(i - kFirstWall) / 2);
     all[i] = with_all_axes(all[i], u);
   }
   return with_tensors(all);
+}
+
+std::vector<double> FlowEquation::nu_values() const {
+  const auto values = nu.detach().to(at::kCPU, at::kDouble).reshape({-1});
+  const auto of = values.accessor<double, 1>();
+  std::vector<double> found(of.size(0));
+  for (int64_t i = 0; i < of.size(0); ++i) found[i] = of[i];
+  return found;
+}
+
+double FlowEquation::largest_nu() const {
+  double largest = 0;
+  for (const double value : nu_values()) largest = std::max(largest, value);
+  return largest;
+}
+
+at::Tensor FlowEquation::nu_gradient(const at::Tensor& terms) const {
+  if (nu.dim() == 0) return total(terms);
+  std::vector<int64_t> axes;
+  for (int64_t axis = 1; axis < terms.dim(); ++axis) axes.push_back(axis - terms.dim());
+  return at::sum_to(sum_in_order(terms, axes), nu.sizes());
 }
 
 std::vector<at::Tensor> FlowEquation::tensors() const {

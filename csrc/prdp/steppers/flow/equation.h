@@ -26,7 +26,7 @@ struct FlowEquation {
 
   std::shared_ptr<const FlowBox> box;
   double dt;
-  at::Tensor nu;          // 0-dimensional
+  at::Tensor nu;          // (), or (batch or 1,)
   at::Tensor force = {};  // (d,) or (batch or 1, d, *shape); undefined: none
   at::Tensor inflow = {}; // (d,) or (batch or 1, d, *shape with one cell along the open axis)
   /// Of the walls that move along themselves, low and high along each axis: (d,) or (batch or 1, d, *shape without the
@@ -37,14 +37,20 @@ struct FlowEquation {
   FlowPressure pressure = FlowPressure::kIncremental;
 
   bool is_diffused_implicitly() const { return diffusion == FlowDiffusion::kImplicit; }
-  /// Raises ValueError or TypeError for what is out of range or does not fit the box. Returns nu dt Σ 2/dx².
+  /// Raises ValueError or TypeError for what is out of range or does not fit the box. Returns nu dt Σ 2/dx² of the
+  /// largest nu.
   double check() const;
   /// And for what does not fit the state.
   double check(const at::Tensor& u) const;
   /// And, for so many steps, where one in the dtype of the state would lose its mean.
   void check_steps(const at::Tensor& u, int64_t steps) const;
-  /// The tensors in the dtype and on the device of a state; all but nu with all their axes.
+  /// The tensors in the dtype and on the device of a state, with all their axes but for a nu without any.
   FlowEquation for_state(const at::Tensor& u) const;
+  /// nu as numbers of the host, one or one for each sample; and the largest, 0 of none.
+  std::vector<double> nu_values() const;
+  double largest_nu() const;
+  /// The gradient of nu, with its axes, from terms (batch or 1, …), which it sums. Of an equation for_state().
+  at::Tensor nu_gradient(const at::Tensor& terms) const;
   /// The tensors that may have a gradient.
   std::vector<at::Tensor> tensors() const;
   FlowEquation with_tensors(at::TensorList tensors) const;

@@ -4,6 +4,7 @@
 
 #include <array>
 #include <cmath>
+#include <numeric>
 #include <vector>
 
 #include "prdp/kernels/loops.h"
@@ -74,17 +75,27 @@ void add_row_back(const AdvectionTerm<T>& t, const T* bars, T* c_bar, T* w_bar, 
   add(kHigh, edge + t.step);
 }
 
+/// ν of each sample.
+class SampleNumbers {
+ public:
+  explicit SampleNumbers(const FlowEquation& e) : values_(e.nu_values()) {}
+  double operator[](int64_t sample) const { return values_[values_.size() == 1 ? 0 : sample]; }
+
+ private:
+  std::vector<double> values_;
+};
+
 template <class T>
 void advect(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& out) {
   const GhostedGrid grid(*e.box);
   const int64_t d = e.box->dim(), cells = grid.cells();
-  const double nu = e.nu.item<double>();
+  const SampleNumbers nu(e);
   const T* given = padded.const_data_ptr<T>();
   T* result = out.mutable_data_ptr<T>();
   for_each_sample(out, [&](int64_t s) {
     const T* p = given + s * d * grid.field;
     T* o = result + s * d * cells;
-    for_each_term<T>(e, grid, nu, [&](int64_t c, int64_t w, const AdvectionTerm<T>& term, double) {
+    for_each_term<T>(e, grid, nu[s], [&](int64_t c, int64_t w, const AdvectionTerm<T>& term, double) {
       grid.for_each_row([&](int64_t at, int64_t to) {
         kernels::loops<T>().advect_row(term, p + c * grid.field + at, p + w * grid.field + at, o + c * cells + to,
                                        grid.n[2]);
@@ -93,11 +104,13 @@ void advect(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& o
   });
 }
 
+/// Returns the cotangent of ν by each sample.
 template <class T>
-double advect_back(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& g, const at::Tensor& bar) {
+std::vector<double> advect_back(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& g,
+                                const at::Tensor& bar) {
   const GhostedGrid grid(*e.box);
   const int64_t d = e.box->dim(), cells = grid.cells(), n = grid.n[2];
-  const double nu = e.nu.item<double>();
+  const SampleNumbers nu(e);
   const T *values = padded.const_data_ptr<T>(), *cotangents = g.const_data_ptr<T>();
   T* result = bar.mutable_data_ptr<T>();
   std::vector<double> nu_bars(g.size(0));
@@ -105,7 +118,7 @@ double advect_back(const FlowEquation& e, const at::Tensor& padded, const at::Te
     const T *p = values + s * d * grid.field, *given = cotangents + s * d * cells;
     T* b = result + s * d * grid.field;
     std::vector<T> bars(kBars * n);
-    for_each_term<T>(e, grid, nu, [&](int64_t c, int64_t w, const AdvectionTerm<T>& term, double per_nu) {
+    for_each_term<T>(e, grid, nu[s], [&](int64_t c, int64_t w, const AdvectionTerm<T>& term, double per_nu) {
       std::fill_n(bars.data() + kDiffusion * n, n, T(0));
       grid.for_each_row([&](int64_t at, int64_t from) {
         kernels::loops<T>().advect_row_back(term, p + c * grid.field + at, p + w * grid.field + at,
@@ -117,9 +130,7 @@ double advect_back(const FlowEquation& e, const at::Tensor& padded, const at::Te
       nu_bars[s] += sum * per_nu;
     });
   });
-  double nu_bar = 0;
-  for (const double of_sample : nu_bars) nu_bar += of_sample;
-  return nu_bar;
+  return nu_bars;
 }
 
 template <class T>
@@ -157,9 +168,11 @@ at::Tensor advect_and_diffuse(const FlowEquation& equation, const at::Tensor& pa
 ExplicitVjp advect_and_diffuse_vjp(const FlowEquation& equation, const at::Tensor& padded,
                                    const at::Tensor& cotangent) {
   const auto g = cotangent.contiguous(), bar = at::zeros_like(padded);
-  const double nu = padded.scalar_type() == at::kFloat ? advect_back<float>(equation, padded, g, bar)
-                                                       : advect_back<double>(equation, padded, g, bar);
-  return {bar, at::full({}, nu, padded.options())};
+  const auto of_samples = padded.scalar_type() == at::kFloat ? advect_back<float>(equation, padded, g, bar)
+                                                             : advect_back<double>(equation, padded, g, bar);
+  if (equation.nu.numel() > 1) return {bar, at::tensor(of_samples, padded.options()).view_as(equation.nu)};
+  const double sum = std::accumulate(of_samples.begin(), of_samples.end(), 0.0);
+  return {bar, at::full_like(equation.nu, sum)};
 }
 
 at::Tensor courant_numbers_by_loops(const FlowEquation& equation, const at::Tensor& u) {

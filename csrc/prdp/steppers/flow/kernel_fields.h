@@ -12,7 +12,8 @@ namespace prdp::flow_kernels {
 inline gpu::FlowGrid grid_of(const FlowBox& box) {
   static_assert(static_cast<int>(FlowBoundary::kPeriodic) == gpu::kPeriodicEnds &&
                 static_cast<int>(FlowBoundary::kWall) == gpu::kWallEnds &&
-                static_cast<int>(FlowBoundary::kOpen) == gpu::kOpenEnds);
+                static_cast<int>(FlowBoundary::kOpen) == gpu::kOpenEnds &&
+                static_cast<int>(FlowBoundary::kSlip) == gpu::kSlipEnds);
   gpu::FlowGrid grid{static_cast<int>(box.dim()), {1, 1, 1}, {}, {1, 1, 1}};
   for (int64_t axis = 0; axis < box.dim(); ++axis) {
     const int64_t a = axis + 3 - box.dim();
@@ -53,11 +54,11 @@ gpu::FlowField<T> field_of(const FlowParts& parts) {
   return field;
 }
 
-/// A tensor without axes, which may be on the host: nobody waits for it. Undefined: 0.
+/// A tensor without axes, which may be on the host: nobody waits for it; or (batch or 1, 1, …). Undefined: 0.
 template <class T>
 gpu::FlowNumber<T> number_of(const at::Tensor& t) {
-  if (t.defined() && t.is_cpu()) return {nullptr, t.item<T>()};
-  return {data_of<const T>(t), T(0)};
+  if (t.defined() && t.dim() == 0 && t.is_cpu()) return {nullptr, 0, t.item<T>()};
+  return {data_of<const T>(t), t.defined() && t.numel() > 1 ? t.stride(0) : 0, T(0)};
 }
 
 template <class T>

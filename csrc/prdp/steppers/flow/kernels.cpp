@@ -131,13 +131,15 @@ std::optional<Corrected> correct(const FlowBox& box, const UncorrectedVelocity& 
 at::Tensor diffusion_coefficients(const FlowEquation& e, const at::Tensor& like) {
   const auto& patterns = e.box->fields(like.options()).diffusion;
   auto sizes = patterns[0].sizes().vec();
-  sizes[0] = static_cast<int64_t>(patterns.size());
+  sizes[0] = e.nu.numel();
+  sizes.insert(sizes.begin(), static_cast<int64_t>(patterns.size()));
   const auto out = at::empty(sizes, like.options());
   const bool launched = each_point({"FlowDiffusionEntries", kFlow}, out, out.numel(), [&]<class T>(T) {
     gpu::FlowDiffusionEntries<T> of{.patterns = {},
                                     .nu = number_of<T>(e.nu),
                                     .dt = e.dt,
-                                    .entries = static_cast<int>(sizes[1]),
+                                    .samples = static_cast<int>(sizes[1]),
+                                    .entries = static_cast<int>(sizes[2]),
                                     .cells = static_cast<int>(cells_of(*e.box)),
                                     .out = data_of<T>(out)};
     for (size_t k = 0; k < patterns.size(); ++k) of.patterns[k] = data_of<const T>(patterns[k]);

@@ -50,7 +50,7 @@ struct CorrectionOptions {
 std::optional<Corrected> correct(const FlowBox& box, const UncorrectedVelocity& of, const at::Tensor& found,
                                  const CorrectionOptions& how);
 
-/// The coefficients of I - ν dt Δ, (patterns, 2 d + 1, *shape).
+/// The coefficients of I - ν dt Δ, (patterns, batch or 1, 2 d + 1, *shape).
 at::Tensor diffusion_coefficients(const FlowEquation& equation, const at::Tensor& like);
 
 /// The reports of solves as one; `refused` as above. Undefined parts where there is no kernel.

@@ -15,7 +15,12 @@ namespace prdp {
 
 namespace {
 
-double largest_courant_number(const FlowEquation& e) { return courant_limit(e).at(e.nu.item<double>()); }
+/// The largest Courant number of each sample, or of all.
+std::vector<double> largest_courant_numbers(const FlowEquation& e) {
+  auto numbers = e.nu_values();
+  for (double& nu : numbers) nu = courant_limit(e).at(nu);
+  return numbers;
+}
 
 /// What is not finite in sample i: the inflow that makes the boundary values of u, the force, a wall, or u.
 std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i) {
@@ -32,6 +37,16 @@ std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i
     if (bad.any().item<bool>()) return said(name, bad);
   }
   return said("the velocity", nonfinite(u[i]));
+}
+
+/// What may have made the velocity so large: central advection lets waves grow in explicit Euler. Else empty.
+std::string growth_of_waves(const FlowEquation& e, const at::Tensor& u, int64_t sample) {
+  const auto of_sample = u[sample].detach();
+  const double square = of_sample.square().sum(0).max().item<double>();
+  const auto nu = e.nu_values();
+  const double longest = 2 * nu[nu.size() == 1 ? 0 : sample] / square;
+  if (e.advection != FlowAdvection::kCentral || !(longest < e.dt)) return {};
+  return "; with central advection waves grow where dt > 2 nu/|u|², here " + three_digits(longest);
 }
 
 }  // namespace
@@ -51,7 +66,8 @@ RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
   given.push_back(equation.force);
   for (const auto& t : given)
     if (t.defined()) finite = finite.logical_and(t.isfinite().flatten(1).all(1));
-  const auto fine = courant.le(largest_courant_number(equation)).logical_and_(courant.isfinite()).logical_and_(finite);
+  const auto largest = at::tensor(largest_courant_numbers(equation), at::kDouble).to(courant.options());
+  const auto fine = courant.le(largest).logical_and_(courant.isfinite()).logical_and_(finite);
   if (fine.all().item<bool>()) return {};
   finite = finite.logical_and(u.isfinite().flatten(1).all(1));  // of a finite u, too, dt Σ |u|/dx may overflow
   const auto diverged = at::full_like(courant, static_cast<double>(SolveStatus::kDiverged)).to(at::kLong);
@@ -69,6 +85,7 @@ void report_refused(const FlowEquation& equation, const at::Tensor& u, const Ref
   if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;
   const auto courant = courant_numbers(equation, u);
   std::ostringstream text;
+  const auto largest = largest_courant_numbers(equation);
   const auto failed = refused.mask.nonzero().flatten();
   text << "Flow: " << failed.size(0) << " of " << u.size(0) << " samples failed";
   for (int64_t k = 0; k < std::min<int64_t>(failed.size(0), 4); ++k) {
@@ -78,7 +95,7 @@ void report_refused(const FlowEquation& equation, const at::Tensor& u, const Ref
     if (status == SolveStatus::kNonfiniteInput) text << ": " << nonfinite_part(equation, u, i);
     else
       text << ": dt Σ |u|/dx is " << courant[i].item<double>() << ", and the explicit advection needs at most "
-           << largest_courant_number(equation) << "; take a smaller dt";
+           << largest[largest.size() == 1 ? 0 : i] << "; take a smaller dt" << growth_of_waves(equation, u, i);
   }
   raise_or_warn(text.str(), on_failure);
 }

@@ -4,7 +4,6 @@
 
 #include <algorithm>
 
-#include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/explicit_loops.h"
 
@@ -65,9 +64,10 @@ at::Tensor laplacian(const FlowBox& box, const Padded& u, int64_t c) {
 at::Tensor advect_and_diffuse_tensors(const FlowEquation& equation, const at::Tensor& ghosts) {
   const auto& box = *equation.box;
   const Padded padded(box, ghosts);
+  const auto nu = equation.nu.dim() == 0 ? equation.nu : equation.nu.squeeze(1);  // beside one component
   std::vector<at::Tensor> components;
   for (int64_t c = 0; c < box.dim(); ++c) {
-    auto sum = laplacian(box, padded, c) * equation.nu;
+    auto sum = laplacian(box, padded, c) * nu;
     for (int64_t axis = 0; axis < box.dim(); ++axis)
       sum = sum - advection(box, padded, box.dim() - 1 - c, axis, equation.advection);
     components.push_back(sum);
@@ -123,11 +123,12 @@ void ghosts_back(const FlowEquation& equation, at::Tensor padded, TendencyVjp& f
         first.add_(high);
         break;
       case FlowBoundary::kWall:
+      case FlowBoundary::kSlip:
         if (!found.wall_velocity.empty()) {
           found.wall_velocity[2 * axis] = add_wall_back(equation, axis, false, low);
           found.wall_velocity[2 * axis + 1] = add_wall_back(equation, axis, true, high);
         }
-        first.sub_(low);
+        first.add_(low, fields.low_sign[axis]);
         last.add_(fields.high_sign[axis] * high);
         break;
       case FlowBoundary::kOpen:
@@ -164,7 +165,8 @@ at::Tensor with_ghosts(const FlowEquation& equation, const at::Tensor& u) {
     switch (box.boundary(axis)) {
       case FlowBoundary::kPeriodic: padded = at::cat({last, padded, first}, d); break;
       case FlowBoundary::kWall:
-        padded = at::cat({add_wall(equation, axis, false, -first), padded,
+      case FlowBoundary::kSlip:
+        padded = at::cat({add_wall(equation, axis, false, fields.low_sign[axis] * first), padded,
                           add_wall(equation, axis, true, fields.high_sign[axis] * last)},
                          d);
         break;
@@ -194,7 +196,7 @@ TendencyVjp tendency_vjp(const FlowEquation& equation, const at::Tensor& u, cons
   if (fields.friction.defined()) {
     const auto held = fields.friction * g;
     found.u = found.u - equation.nu * held;
-    found.nu = found.nu - total(held * u);
+    found.nu = found.nu - equation.nu_gradient(held * u);
   }
   return found;
 }
