@@ -171,8 +171,8 @@ class Diffusion(Operator):
             of_axes = isinstance(given, (tuple, list)) and len(given) == dim
             if not of_axes or any(not isinstance(pair, (tuple, list)) or len(pair) != 2 for pair in given):
                 raise ValueError(
-                    f"Diffusion: {name} must be a number, a tensor, or a pair (low, high) for each of {dim} axes, got "
-                    f"{given!r:.80}"
+                    f"Diffusion: {name} must be a number, a tensor, or a pair (low, high) for each of {dim} axes, "
+                    f"(None, None) for one without, got {given!r:.80}"
                 )
             pairs = [[0.0 if value is None else value for value in pair] for pair in given]
             stray = any(

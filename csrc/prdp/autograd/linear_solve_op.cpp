@@ -17,6 +17,7 @@
 #include "prdp/solvers/memory_check.h"
 #include "prdp/solvers/report_failures.h"
 #include "prdp/solvers/solve_on_gpu.h"
+#include "prdp/solvers/uneven_rows.h"
 #include "prdp/solvers/warnings.h"
 
 namespace prdp {
@@ -220,7 +221,10 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
                        .hierarchy = options.hierarchy.get()});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
-  report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);
+  const SolveRole role{spec, s, spec.transposed, x0};
+  report_failures(role, *a, b, info, options.on_failure);
+  if (options.on_failure == OnFailure::kRaise || options.on_failure == OnFailure::kWarn)
+    warn_of_uneven_rows(role, *a, rhs, result);
   if (looks_at_product) warn_of_nonlinear_product(spec, b, result.u, info.residual);
   for (auto* part : info.parts())
     if (part->device() != b.device()) *part = part->to(b.device());

@@ -40,7 +40,9 @@ void Grid::check_field(const at::Tensor& v, int64_t channels) const {
     for (const int64_t n : shape_) expected << ", " << n;
     std::ostringstream got;
     for (size_t i = 0; i < sizes.size(); ++i) got << (i ? ", " : "") << sizes[i];
-    TORCH_CHECK_VALUE(false, owner_, ": expected (batch, ", channels, expected.str(), "), got (", got.str(), ")");
+    const bool other_fields = channels == 1 && v.dim() == dim() + 2 && sizes[1] > 1;
+    TORCH_CHECK_VALUE(false, owner_, ": expected (batch, ", channels, expected.str(), "), got (", got.str(), ")",
+                      other_fields ? "; fields of several channels are samples: u.flatten(0, 1).unsqueeze(1)" : "");
   }
   TORCH_CHECK_TYPE(v.scalar_type() == at::kFloat || v.scalar_type() == at::kDouble, owner_,
                    ": expected float32 or float64, got ", v.scalar_type());

@@ -106,6 +106,12 @@ bool holds_numbers(const at::Tensor& t) {
 
 const char* transpose_name() { return in_language("transpose", "apply_transpose"); }
 
+[[noreturn]] void refuse_derivative() {
+  TORCH_CHECK_VALUE(false, "Function: torch cannot differentiate ", product_name(),
+                    " with respect to its vector; make it of torch operations, or give ", transpose_name(),
+                    in_language(", or symmetric=True", ""));
+}
+
 at::Tensor solve_with(const at::Tensor& matrix, const at::Tensor& b) {
   return solve_dense(matrix, b.flatten(1).unsqueeze(-1)).reshape_as(b);
 }
@@ -172,7 +178,9 @@ at::Tensor FunctionOperator::recorded_product(const at::Tensor& v, const std::ve
   try {
     return product(registered_->products().apply, v, tensors, product_name());
   } catch (const std::exception& error) {
-    if (std::string_view(error.what()).find("Inference tensors cannot be saved") == std::string_view::npos) throw;
+    const std::string_view text(error.what());
+    if (text.find("numpy() on Tensor that requires grad") != std::string_view::npos) refuse_derivative();
+    if (text.find("Inference tensors cannot be saved") == std::string_view::npos) throw;
   }
   TORCH_CHECK_VALUE(false, "Function: ", product_name(),
                     " uses a tensor that was made in inference mode, which autograd ",
@@ -193,10 +201,7 @@ at::Tensor FunctionOperator::derivative_transposed(const at::Tensor& v) const {
     return torch::autograd::grad({at_zero->product}, {at_zero->point}, {create_graph ? v : v.detach()},
                                  /*retain_graph=*/true, create_graph, /*allow_unused=*/true)[0];
   });
-  TORCH_CHECK_VALUE(found.defined(), "Function: torch cannot differentiate ", product_name(),
-                    " with respect to its vector; make it of "
-                    "torch operations, or give ",
-                    transpose_name());
+  if (!found.defined()) refuse_derivative();
   return found;
 }
 

@@ -120,6 +120,7 @@ std::string minres_breakdown(const FailedSample& sample) {
   return "A is singular, and b lies outside its range; take a b without that part";
 }
 
+constexpr const char* kNullVectors = ". If A is singular, name all its null vectors (nullspace)";
 constexpr const char* kLostCoarseGrids =
     "in float32 its coarse grids may lose what keeps A from being singular; take CG with multigrid, Direct or float64";
 
@@ -139,7 +140,9 @@ std::string diverged(const FailedSample& sample) {
     case MadeFor::kDefinite: return "the residual grew beyond ‖b‖: " + not_definite(sample);
     default:
       if (loses_coarse_grids(sample)) return c10::str("the residual grew beyond 1e13 ‖b‖: ", kLostCoarseGrids);
-      return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct";
+      return c10::str(
+          "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct",
+          kNullVectors);
   }
 }
 
@@ -199,7 +202,8 @@ std::string stagnated(const FailedSample& sample) {
            "solve it once in float64 to see, and if it is, stay there";
   if (sample.method().counts == Counts::kCycles)
     return c10::str("its cycles take nothing more off the residual; take a larger restart, ",
-                    multigrid ? "no multigrid" : "a preconditioner", ", or Direct", single ? ", or float64" : "");
+                    multigrid ? "no multigrid" : "a preconditioner", ", or Direct", single ? ", or float64" : "",
+                    kNullVectors);
   const char* another = method == Method::kDirect ? "take an iterative method"
                         : multigrid               ? "take another preconditioner than multigrid, or Direct"
                                                   : "take another preconditioner or Direct";

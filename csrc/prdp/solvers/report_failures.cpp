@@ -3,9 +3,6 @@
 #include <c10/util/Exception.h>
 
 #include <algorithm>
-#include <bit>
-#include <map>
-#include <mutex>
 #include <sstream>
 #include <tuple>
 
@@ -166,14 +163,6 @@ bool warn_of_stopped(const Report& report) {
   return true;
 }
 
-/// Whether this is the 1st, 2nd, 4th, 8th, … time, so that looks cost little however often they are asked for.
-bool should_look(const std::string& at) {
-  static std::mutex mutex;
-  static std::map<std::string, uint64_t> times;
-  const std::lock_guard lock(mutex);
-  return std::has_single_bit(++times[at]) || c10::WarningUtils::get_warnAlways();
-}
-
 /// Where many products did not lead to rtol, though no residual grew, as A or a preconditioner of one's own is not what
 /// the method is made for. After fewer, the products that tell would cost too much beside the solve.
 void warn_of_unfit(const Report& report, const std::vector<int64_t>& unsolved) {
@@ -181,7 +170,7 @@ void warn_of_unfit(const Report& report, const std::vector<int64_t>& unsolved) {
   const auto& solver = report.role.solver;
   if (!(solver.rtol > 0.0) || steps_of(solver.method, solver.max_iter.expect_int(), solver.restart) < many_products)
     return;
-  if (!should_look(report.key())) return;
+  if (!should_look(std::hash<std::string>()(report.key()))) return;
   const int64_t worst = report.worst_of(unsolved);
   const auto products = report.info.operator_applications[worst].item<int64_t>();
   const double bound = 10.0 * std::max(solver.rtol, report.info.floor[worst].item<double>());

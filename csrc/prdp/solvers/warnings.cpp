@@ -3,8 +3,10 @@
 #include <c10/util/Exception.h>
 
 #include <atomic>
+#include <bit>
 #include <map>
 #include <mutex>
+#include <unordered_map>
 
 #include "prdp/error_text.h"
 
@@ -48,6 +50,13 @@ void raise_or_warn(const std::string& text, OnFailure on_failure) {
           << " the failed ones have no gradient, and a training goes on";
   TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, whole.str());
   warning_sink().load()(whole.str());
+}
+
+bool should_look(size_t at) {
+  static std::mutex mutex;
+  static std::unordered_map<size_t, uint64_t> times;
+  const std::lock_guard lock(mutex);
+  return std::has_single_bit(++times[at]) || c10::WarningUtils::get_warnAlways();
 }
 
 bool should_warn_again(const std::string& key, double size) {

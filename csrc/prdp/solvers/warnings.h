@@ -28,6 +28,9 @@ class FailuresOfStep {
 /// Raises c10::LinAlgError or warns about the failures that `text` names; only for kRaise and kWarn.
 void raise_or_warn(const std::string& text, OnFailure on_failure);
 
+/// Whether this is the 1st, 2nd, 4th, 8th, … time for what the number stands for, so that looks cost little however
+/// often they are asked for.
+bool should_look(size_t at);
 /// Whether there has been no warning for this `key`, or only of what is less than a tenth as bad.
 bool should_warn_again(const std::string& key, double size);
 /// Warns with this text, and says that it will not be said again unless it gets worse.

@@ -1,0 +1,98 @@
+"""Solves that are CONVERGED by their large rows while the small ones are not solved: they say so."""
+
+import warnings
+
+import pytest
+import torch
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+F64 = torch.float64
+
+
+def inpainting(weight, n=64, dtype=F64):
+    """A Laplacian between pixels that are known: the weight of the data, and b."""
+    generator = torch.Generator().manual_seed(0)
+    known = (torch.rand(1, n, n, generator=generator) < 0.02).to(dtype)
+    image = torch.rand(3, 1, n, n, generator=generator).to(dtype)
+    a = operators.Diffusion(torch.ones(1, n, n, dtype=dtype), shift=weight * known, boundary="flux", length=float(n))
+    return a, weight * known * image
+
+
+def penalty(weight, n=40):
+    """A matrix of the second difference with the values at its ends held by a penalty."""
+    a = 2 * torch.eye(n, dtype=F64) - torch.diag(torch.ones(n - 1), 1) - torch.diag(torch.ones(n - 1), -1)
+    a[0, 0] = a[-1, -1] = weight
+    b = torch.zeros(1, n, dtype=F64)
+    b[0, 0], b[0, -1] = weight, 2 * weight
+    return a, b
+
+
+def warnings_of(call):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = call()
+    return found, [str(w.message) for w in caught if "beta state" not in str(w.message)]
+
+
+@pytest.mark.parametrize("preconditioner", ["diagonal", "multigrid"])
+@pytest.mark.parametrize("weight", [1e4, 1e6])
+def test_a_weight_of_data_is_said_with_its_error(weight, preconditioner, always):
+    a, b = inpainting(weight)
+    exact, _ = prdp.linear_solve(a, b, prdp.Direct())
+    (u, info), said = warnings_of(lambda: prdp.linear_solve(a, b, prdp.CG(3000, preconditioner=preconditioner)))
+    error = ((u - exact).abs().amax() / exact.abs().amax()).item()
+    assert (info.status == prdp.SolveStatus.CONVERGED).all()
+    if error < 1e-3:
+        return
+    assert len(said) == 1 and "CONVERGED to rtol = 1e-05, and yet u is off by some" in said[0]
+    claimed = float(said[0].split("by some ")[1].split(" %")[0]) / 100
+    assert claimed < 3 * error
+    rtol = float(said[0].split("rtol=")[1].split(".  ")[0].split(". ")[0])
+    (u, _), said = warnings_of(lambda: prdp.linear_solve(a, b, prdp.CG(9000, rtol, preconditioner=preconditioner)))
+    assert not said and ((u - exact).abs().amax() / exact.abs().amax()).item() < 0.1 * error
+
+
+@pytest.mark.parametrize("sparse", [False, True], ids=["dense", "csr"])
+@pytest.mark.parametrize("solver", [prdp.CG(500, preconditioner="diagonal"), prdp.GMRES(50, restart=40)])
+def test_a_penalty_in_a_matrix(sparse, solver, always):
+    a, b = penalty(1e7)
+    exact = torch.linalg.solve(a, b[0])[None]
+    (u, _), said = warnings_of(lambda: prdp.linear_solve(a.to_sparse_csr() if sparse else a, b, solver))
+    assert len(said) == 1 and "at index (" in said[0] and (u - exact).abs().max() > 1e-3
+    (u, _), said = warnings_of(lambda: prdp.linear_solve(a, b, prdp.Direct()))
+    assert not said and torch.allclose(u, exact)
+
+
+def test_an_adjoint_solve_says_so_too(always):
+    a, b = inpainting(1e6)
+    weights = 1e-2 + b[:1]  # of a loss that sees the data most
+    leaf = torch.rand(1, 1, 64, 64, dtype=F64, requires_grad=True)
+
+    def gradient():
+        u, _ = prdp.linear_solve(a, leaf, prdp.CG(3000, preconditioner="diagonal"))
+        return torch.autograd.grad((weights * u).sum(), leaf)
+
+    _, said = warnings_of(gradient)
+    assert any(text.startswith("adjoint solve: sample 0 CONVERGED") for text in said)
+
+
+def test_it_is_said_once_and_not_where_the_status_is_asked_for():
+    a, b = inpainting(1e5, n=48)
+    solver = prdp.CG(3000, preconditioner="diagonal")
+    _, said = warnings_of(lambda: [prdp.linear_solve(a, b, solver, on_failure="return") for _ in range(4)])
+    assert not said
+    _, said = warnings_of(lambda: [prdp.linear_solve(a, b, solver) for _ in range(4)])
+    assert len(said) == 1 and said[0].endswith("This is said once, and again if it gets ten times worse")
+
+
+@pytest.mark.parametrize("contrast", [1e2, 1e4])
+@pytest.mark.parametrize("solver", [prdp.CG(9000, preconditioner="diagonal"), prdp.CG(300, preconditioner="multigrid")])
+def test_jumps_of_kappa_say_nothing_where_u_is_right(contrast, solver, always):
+    kappa = torch.ones(1, 48, 48, dtype=F64)
+    kappa[:, 10:30, 10:30] = contrast
+    a, b = operators.Diffusion(kappa), torch.rand(2, 1, 48, 48, dtype=F64)
+    exact, _ = prdp.linear_solve(a, b, prdp.Direct())
+    (u, _), said = warnings_of(lambda: prdp.linear_solve(a, b, solver))
+    assert not said and (u - exact).abs().max() < 1e-2 * exact.abs().max()
