@@ -115,9 +115,7 @@ def test_a_uniform_stream_along_them_stays():
 
 
 def test_what_is_refused():
-    with pytest.raises(
-        ValueError, match="is on an axis whose boundary is not 'wall'"
-    ):
+    with pytest.raises(ValueError, match="is on an axis whose boundary is not 'wall'"):
         prdp.Flow((8, 8), nu=0.1, dt=0.01, boundary="slip", wall_velocity={(0, "high"): 1.0})
     with pytest.raises(ValueError, match="boundary must be 'periodic', 'wall', 'slip' or 'open', got 'free'"):
         prdp.Flow((8, 8), nu=0.1, dt=0.01, boundary="free")
