@@ -138,7 +138,17 @@ def test_a_network_sets_it_in_each_update():
     assert all(p.grad.isfinite().all() and p.grad.any() for p in network.parameters())
 
 
+def test_a_batch_without_samples():
+    nu = torch.zeros(0, requires_grad=True)
+    for step in (prdp.Flow((8, 8), nu, 0.01), prdp.Flow((8, 8), nu, 0.01, boundary="wall", diffusion="explicit")):
+        states = step.rollout(torch.zeros(0, 2, 8, 8), 2)
+        (grad,) = torch.autograd.grad(states.sum(), nu)
+        assert states.shape == (0, 3, 2, 8, 8) and grad.shape == (0,)
+
+
 def test_what_is_refused():
+    with pytest.raises(TypeError, match="Flow: nu must be real, got ComplexFloat"):
+        prdp.Flow((8, 8), nu=torch.tensor(1j), dt=0.01)
     u = torch.zeros(3, 2, 8, 8)
     with pytest.raises(ValueError, match=r"Flow: nu holds 2 samples, u holds 3"):
         prdp.Flow((8, 8), nu=torch.tensor([0.1, 0.2]), dt=0.01)(u)

@@ -64,7 +64,7 @@ def test_boundary_and_length_may_be_set():
     other = prdp.Flow((8, 6), 0.1, 0.01, boundary=("wall", "periodic"), length=2.0)
     assert torch.equal(flow(u), other(u)) and not torch.equal(flow(u), periodic)
     flow.boundary[0] = "walls"
-    with pytest.raises(ValueError, match="'periodic', 'wall' or 'open', got 'walls'"):
+    with pytest.raises(ValueError, match="'periodic', 'wall', 'slip' or 'open', got 'walls'"):
         flow(u)
 
 

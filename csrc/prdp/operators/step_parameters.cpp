@@ -4,7 +4,6 @@
 
 #include <cmath>
 #include <limits>
-#include <numeric>
 #include <sstream>
 
 #include "prdp/operators/sums_in_order.h"
@@ -82,9 +81,7 @@ at::Tensor StepParameters::nu_of(const at::Tensor& index) const {
 
 at::Tensor StepParameters::gradient(const at::Tensor& terms) const {
   if (!has_axis() || nu.sym_size(0) == 1) return total(terms).reshape_symint(nu.sym_sizes()).to(nu.options());
-  std::vector<int64_t> axes(terms.dim() - 1);
-  std::iota(axes.begin(), axes.end(), 1 - terms.dim());
-  return (axes.empty() ? terms : sum_in_order(terms, axes).flatten()).to(nu.options());
+  return sample_totals(terms).flatten().to(nu.options());
 }
 
 double number_of(const at::Tensor& t) {

@@ -36,12 +36,15 @@ inline at::Tensor total(const at::Tensor& t) {
   std::iota(axes.begin(), axes.end(), -t.dim());
   return sum_in_order(t, axes).reshape({});
 }
-/// v·w of each sample, (batch, 1, …).
-inline at::Tensor dot_in_order(const at::Tensor& v, const at::Tensor& w) {
-  std::vector<int64_t> axes(v.dim() - 1);
-  std::iota(axes.begin(), axes.end(), 1 - v.dim());
-  return sum_in_order(v * w, axes);
+/// Σ of all numbers of each sample, (batch, 1, …).
+inline at::Tensor sample_totals(const at::Tensor& t) {
+  if (t.dim() == 1) return t;
+  std::vector<int64_t> axes(t.dim() - 1);
+  std::iota(axes.begin(), axes.end(), 1 - t.dim());
+  return sum_in_order(t, axes);
 }
+/// v·w of each sample, (batch, 1, …).
+inline at::Tensor dot_in_order(const at::Tensor& v, const at::Tensor& w) { return sample_totals(v * w); }
 
 /// v, whose last axis runs over the unknowns, without Σ_k (v·dual_k) part_k. A matrix product would sum one row in
 /// another order than many.

@@ -31,11 +31,15 @@ at::Tensor size_of_rows(const Operator& a, const at::Tensor& like) {
   return largest;
 }
 
-/// By what share of the largest entry of u that entry is off at least, at each point and about: |r_i| / (‖a_i‖ |u|).
+/// By what share of its largest entry u is off at least, at each point of the small rows and about: |r_i| / (‖a_i‖
+/// |u|).
 at::Tensor shares_of_error(const Operator& a, const at::Tensor& b, const at::Tensor& u) {
+  constexpr double much_larger = 10.0;
   const auto left = a.project(b - apply_on_loops(a, u, /*transposed=*/false)).abs().to(at::kDouble);
-  const auto rows = size_of_rows(a, b).to(at::kDouble), size = per_sample(sample_maxima(u), b);
-  return at::where(rows.gt(0), left / (rows * size), 0.0);
+  const auto rows = size_of_rows(a, b).to(at::kDouble);
+  const auto largest = per_sample(sample_maxima(rows), b), size = per_sample(sample_maxima(u), b);
+  const auto tells = rows.gt(0) & (rows * much_larger).lt(largest) & size.gt(0);
+  return at::where(tells, left / (rows * size), 0.0);
 }
 
 /// Whether all rows have the same size.
@@ -63,12 +67,12 @@ void warn_of_uneven_rows(const SolveRole& role, const Operator& a, const at::Ten
   warn_once(key.str(), worst, [&](std::ostream& text) {
     const auto place = shares[i].eq(worst);
     text << (role.adjoint ? "adjoint solve" : "linear_solve") << ": sample " << i << " CONVERGED to rtol = " << rtol
-         << ", and yet u is off by some " << three_digits(100.0 * worst) << " % at index "
+         << ", and yet u is off by some " << three_digits(100.0 * worst) << " % or more at index "
          << as_tuple(first_true(place))
          << ": other rows of A are much larger, as with a penalty, and rtol is a share of their b. Take "
          << in_language("Direct()", "Direct{}");
     const double enough = rtol * (rtol / worst);
-    if (enough > 100.0 * epsilon_of(b)) text << " or rtol=" << three_digits(enough);
+    if (enough > 100.0 * epsilon_of(b)) text << " or a smaller rtol, such as " << three_digits(enough);
   });
 }
 

@@ -70,8 +70,9 @@ at::Tensor with_all_axes(at::Tensor t, const at::Tensor& u, int64_t place = 1) {
   return t.to(u.options());
 }
 
-/// Returns the largest nu. Raises ValueError for one that is out of range.
+/// Returns the largest nu. Raises ValueError for one that is out of range, TypeError for one that is complex.
 double check_nu(const FlowEquation& e) {
+  TORCH_CHECK_TYPE(!e.nu.is_complex(), "Flow: nu must be real, got ", e.nu.scalar_type());
   TORCH_CHECK_VALUE(e.nu.dim() <= 1, "Flow: nu must be a number, or a tensor of shape () or (batch or 1,), got ",
                     e.nu.sizes());
   const auto values = e.nu_values();
@@ -188,10 +189,7 @@ double FlowEquation::largest_nu() const {
 }
 
 at::Tensor FlowEquation::nu_gradient(const at::Tensor& terms) const {
-  if (nu.dim() == 0) return total(terms);
-  std::vector<int64_t> axes;
-  for (int64_t axis = 1; axis < terms.dim(); ++axis) axes.push_back(axis - terms.dim());
-  return at::sum_to(sum_in_order(terms, axes), nu.sizes());
+  return nu.dim() == 0 ? total(terms) : at::sum_to(sample_totals(terms), nu.sizes());
 }
 
 std::vector<at::Tensor> FlowEquation::tensors() const {

@@ -38,16 +38,16 @@ enum Saved : size_t {
   kTensors,  // from here on, those of the equation
 };
 
-/// Functions of autograd take no undefined tensors: an empty one stands for none.
-std::vector<at::Tensor> or_empty(std::vector<at::Tensor> tensors, const at::Tensor& u) {
+/// Functions of autograd take no undefined tensors: one of bools, which no equation has, stands for none.
+std::vector<at::Tensor> or_bools(std::vector<at::Tensor> tensors, const at::Tensor& u) {
   for (auto& t : tensors)
-    if (!t.defined()) t = at::empty({0}, u.options());
+    if (!t.defined()) t = at::empty({0}, u.options().dtype(at::kBool));
   return tensors;
 }
 std::vector<at::Tensor> or_undefined(at::TensorList given) {
   auto tensors = given.vec();
   for (auto& t : tensors)
-    if (t.numel() == 0) t = at::Tensor();
+    if (t.scalar_type() == at::kBool) t = at::Tensor();
   return tensors;
 }
 
@@ -66,7 +66,7 @@ SolveResult forward_steps(const FlowEquation& equation, const at::Tensor& u, int
 
 class FlowSteps : public torch::autograd::Function<FlowSteps> {
  public:
-  /// `tensors`: those of the equation, empty ones for none.
+  /// `tensors`: those of the equation, or_bools().
   static variable_list forward(AutogradContext* ctx, const at::Tensor& u, at::TensorList tensors,
                                const c10::intrusive_ptr<Call>& call) {
     const at::AutoDispatchBelowADInplaceOrView below;
@@ -182,7 +182,7 @@ SolveResult flow_steps(const FlowEquation& equation, const at::Tensor& u, int64_
     return forward_steps(equation, u.detach(), steps, output, options);
   }
   auto call = c10::make_intrusive<Call>();
-  const auto tensors = or_empty(with_gradients_along_walls(equation).tensors(), u);
+  const auto tensors = or_bools(with_gradients_along_walls(equation).tensors(), u);
   call->equation = equation.with_tensors(std::vector<at::Tensor>(tensors.size()));
   call->steps = steps;
   call->output = output;
