@@ -32,12 +32,12 @@ class Flow(HoldsTensors, Stepper):
 
     Args:
         shape: the cells, (Ny, Nx) or (Nz, Ny, Nx), at least 3 per axis.
-        nu: viscosity >= 0, length²/time: a number or a tensor, which gets a gradient: 0-dimensional, or (batch,), one
-            for each sample. A Parameter becomes one of the module, and another tensor a buffer. The same holds for
-            `force`, `inflow` and `wall_velocity`.
-        dt: time step > 0. The advection needs dt Σ |u|/dx <= 1, or with central advection and implicit diffusion at
-            most √(2 nu dt)/dx for the largest dx where that is larger, and with upwind advection and explicit
-            diffusion at most 1 - nu dt Σ 2/dx²; a longer step raises an error.
+        nu: viscosity >= 0, length²/time: a number or a tensor, which gets a gradient: 0-dimensional, or
+            (batch or 1,), one for each sample. A Parameter becomes one of the module, and another tensor a buffer. The
+            same holds for `force`, `inflow` and `wall_velocity`.
+        dt: time step > 0. dt Σ |u|/dx may be at most 1; with central advection and implicit diffusion at most
+            max(1, √(2 nu dt)/dx) for the largest dx; with upwind advection and explicit diffusion at most
+            1 - nu dt Σ 2/dx². A longer step raises an error.
         boundary: one for all axes, or one per axis in the order of `shape`.
             "periodic".
             "wall": no slip at both ends. The low face of the first cell lies on the wall.
@@ -60,9 +60,10 @@ class Flow(HoldsTensors, Stepper):
         solver: for the pressure and the implicit diffusion, both symmetric. CG(100) with multigrid by default.
         backward and the other options: as in `Stepper`, but `start` must be "zero".
 
-    All but `shape` may be set at any time. A tensor that is set later as `nu`, `force`, `inflow` or `wall_velocity` is
-    for the steps that follow, as the output of a network is: it is no state, so that copies and `state_dict` have what
-    was there before. A Parameter, a `torch.nn.Buffer`, numbers and `obstacle` are state.
+    All but `shape` may be set at any time, `pressure` by the name `pressure_form`. A tensor that is set later as `nu`,
+    `force`, `inflow` or `wall_velocity`, such as the output of a network, is used in the steps that follow but not
+    saved: copies and `state_dict` keep the earlier value. Parameters, buffers and `obstacle` are saved; plain numbers
+    go into copies, not into `state_dict`.
 
     `info` combines the solves of a step: it has the sum of their iterations, the worst status and the largest residual.
     Each step stores one state for the backward pass, and computes the rest again.

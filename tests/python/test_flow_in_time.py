@@ -28,8 +28,8 @@ def smooth(n):
     return u / u.abs().max()
 
 
-def after(kind, name, u, steps, final=0.4):
-    flow = kind((16, 16), dt=final / steps, diffusion="explicit", solver=prdp.Direct(), **settings(name))
+def after(kind, name, u, steps, final=0.4, diffusion="explicit"):
+    flow = kind((16, 16), dt=final / steps, diffusion=diffusion, solver=prdp.Direct(), **settings(name))
     return flow.rollout(flow.project(u), steps)[:, -1]
 
 
@@ -41,6 +41,13 @@ def test_a_step_is_first_order_and_the_mean_of_two_second(name):
         errors = [(after(kind, name, u, steps) - exact).norm() / exact.norm() for steps in (50, 100)]
         assert errors[0] / errors[1] == pytest.approx(factor, rel=0.1), (kind, errors)
     assert errors[1] < 1e-4
+
+
+def test_implicit_diffusion_stays_first_order():
+    u = smooth(16)
+    exact = after(Heun, "periodic", u, 1600)
+    errors = [(after(Heun, "periodic", u, steps, diffusion="implicit") - exact).norm() for steps in (50, 100)]
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
 
 
 def test_its_rollout_and_its_gradient_are_those_of_its_steps():

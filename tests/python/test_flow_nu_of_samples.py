@@ -10,7 +10,7 @@ from test_gpu_flow import CASES, F32, F64, flow, noise
 import prdp_torch as prdp
 
 WAYS = {"loops": contextlib.nullcontext, "kernels": Fibers}
-FACTORS = torch.tensor([0.3, 1.0, 40.0], dtype=F64)  # the last is beyond what takes the whole pressure off
+FACTORS = torch.tensor([0.3, 1.0, 40.0], dtype=F64)  # for the last, a share of the pressure is taken off (balance.cpp)
 names = pytest.mark.parametrize("name", CASES)
 
 
@@ -107,7 +107,7 @@ def test_one_nu_of_shape_one_is_for_all_samples():
 
 @pytest.mark.parametrize("way", WAYS)
 def test_no_viscosity_in_one_sample(way):
-    """Where the others are beyond what takes the whole pressure off."""
+    """Of the others only a share of the pressure is taken off."""
     nu = torch.tensor([0.0, 5.0, 5.0], dtype=F64, requires_grad=True)
     with WAYS[way]():
         step = flow("viscous", F64, nu)

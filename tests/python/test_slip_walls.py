@@ -55,7 +55,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("nu", [0.02, 3.0], ids=["little friction", "much friction"])
+@pytest.mark.parametrize("nu", [0.02, 3.0], ids=["low viscosity", "high viscosity"])
 @pytest.mark.parametrize("advection", ["central", "upwind"])
 @pytest.mark.parametrize("diffusion", ["implicit", "explicit"])
 @pytest.mark.parametrize("shape, boundary", CASES)

@@ -6,11 +6,11 @@
 #include <numeric>
 #include <vector>
 
-/// Sums whose last bit tells neither how many threads there are nor what else is in the batch. Differentiable.
+/// Sums whose last bit depends neither on the number of threads nor on the rest of the batch. Differentiable.
 namespace prdp {
 
-/// sum(t), over the axes that it says (counted from the end). Torch shares a large sum among threads where it is the
-/// only one of a tensor, in parts as many as these: so it gets a twin here, and each thread its own.
+/// sum(t, axes), with axes counted from the end. PyTorch splits a large sum among the threads if it is the only one of
+/// its tensor, and its last bit then depends on their number. So two copies are summed, each by one thread.
 template <class Sum>
 at::Tensor in_order(const at::Tensor& t, at::IntArrayRef axes, const Sum& sum) {
   if (!t.is_cpu() || at::isTensorSubclassLike(t) || t.numel() < at::internal::GRAIN_SIZE) return sum(t, axes);

@@ -4,7 +4,6 @@
 #include <c10/util/hash.h>
 
 #include <algorithm>
-#include <limits>
 
 #include "prdp/error_text.h"
 #include "prdp/gpu/runtime.h"
@@ -19,8 +18,8 @@ namespace prdp {
 
 namespace {
 
-/// About the norm of each row of A, as products with a few vectors of no structure have it: so many that none of
-/// thousands of rows is nearly at right angles to them all.
+/// Estimates the norm of each row of A by its largest product with a few vectors of no structure: enough that none of
+/// thousands of rows is nearly orthogonal to all of them.
 at::Tensor size_of_rows(const Operator& a, const at::Tensor& like) {
   constexpr int64_t vectors = 4;
   auto v = unstructured_like(like), largest = apply_on_loops(a, v, /*transposed=*/false).abs();
@@ -31,8 +30,8 @@ at::Tensor size_of_rows(const Operator& a, const at::Tensor& like) {
   return largest;
 }
 
-/// By what share of its largest entry u is off at least, at each point of the small rows and about: |r_i| / (‖a_i‖
-/// |u|).
+/// An approximate lower bound of the error at each point of a small row, as a share of the largest |u|:
+/// |r_i| / (‖a_i‖ max |u|).
 at::Tensor shares_of_error(const Operator& a, const at::Tensor& b, const at::Tensor& u) {
   constexpr double much_larger = 10.0;
   const auto left = a.project(b - apply_on_loops(a, u, /*transposed=*/false)).abs().to(at::kDouble);
@@ -42,7 +41,7 @@ at::Tensor shares_of_error(const Operator& a, const at::Tensor& b, const at::Ten
   return at::where(tells, left / (rows * size), 0.0);
 }
 
-/// Whether all rows have the same size.
+/// Rows of these differ at the boundary alone: there is no need to look.
 bool has_even_rows(const OperatorSpec& a) { return a.kind == "poisson" || a.kind == "heat"; }
 
 }  // namespace
@@ -67,11 +66,11 @@ void warn_of_uneven_rows(const SolveRole& role, const Operator& a, const at::Ten
   warn_once(key.str(), worst, [&](std::ostream& text) {
     const auto place = shares[i].eq(worst);
     text << (role.adjoint ? "adjoint solve" : "linear_solve") << ": sample " << i << " CONVERGED to rtol = " << rtol
-         << ", and yet u is off by some " << three_digits(100.0 * worst) << " % or more at index "
+         << ", but u is off by at least about " << three_digits(100.0 * worst) << " % of its largest entry at index "
          << as_tuple(first_true(place))
-         << ": other rows of A are much larger, as with a penalty, and rtol is a share of their b. Take "
+         << ": other rows of A, such as those of a penalty, are much larger and make up ‖b‖. Take "
          << in_language("Direct()", "Direct{}");
-    const double enough = rtol * (rtol / worst);
+    const double enough = rtol * (rtol / worst);  // the error falls with rtol, here to about rtol
     if (enough > 100.0 * epsilon_of(b)) text << " or a smaller rtol, such as " << three_digits(enough);
   });
 }

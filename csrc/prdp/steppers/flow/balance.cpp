@@ -6,17 +6,18 @@ namespace prdp {
 
 namespace {
 
-/// With the whole pressure of the explicit part, waves beside walls grow from a ν dt/dx² of 10 to 16 on, in thin boxes
-/// and on cells that are long and thin. Measured as the spectral radius of steps of Stokes flow.
+/// If the whole pressure of the explicit part is taken off, waves beside walls grow from ν dt/dx² = 10 to 16 on, in
+/// thin boxes and on long, thin cells. Measured as the spectral radius of steps of Stokes flow.
 constexpr double kLargestWhole = 4;
 
-/// So does a flow around an island through a throat one cell wide, whose drag the pressure hands to all the fluid that
-/// moves as one: from ν dt Σ 1/dx² over the axes across the throat of 1.5 on, the longer the way around the sooner.
+/// Around an island with a throat one cell wide a flow grows too: the pressure passes the drag of the throat on to all
+/// the fluid that moves as one. This begins at ν dt Σ 1/dx² = 1.5, summed over the axes across the throat; the longer
+/// the way around, the sooner.
 constexpr double kLargestWholeOfThroats = 1.25;
 
-bool is_incremental(const FlowEquation& e) {
+bool is_incremental(const FlowEquation& e, const at::Tensor& like) {
   return e.is_diffused_implicitly() && e.pressure == FlowPressure::kIncremental &&
-         e.box->fields(e.nu.options()).free.defined();
+         e.box->fields(like.options()).free.defined();
 }
 
 /// The share of this pressure that is taken off, of all samples or of each; undefined: the whole of all.
@@ -40,9 +41,9 @@ double largest_viscosity(const FlowEquation& e) {
 }
 
 Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
-  if (!is_incremental(e)) return {change, {}};
-  const double limit = largest_viscosity(e);
+  if (!is_incremental(e, change)) return {change, {}};
   if (flow_kernels::can_run(change)) {
+    const double limit = largest_viscosity(e);
     const ProjectionLaunch by{
         {.added = {change}}, {.added = {change}, .share_by_nu = e.nu, .largest_nu = limit}, {.factor = -1.0}};
     if (const auto found = project_by_kernels(*e.box, by, options, info)) return {found->u, found->potential};
@@ -57,8 +58,8 @@ namespace {
 
 FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& potential_bar,
                       const SolveOptions& options, CombinedInfo& info) {
-  const double limit = largest_viscosity(e);
   if (flow_kernels::can_run(cotangent[0])) {
+    const double limit = largest_viscosity(e);
     const ProjectionLaunch by{
         {.added = cotangent, .potential_bar = potential_bar, .share_by_nu = e.nu, .largest_nu = limit},
         {.added = cotangent},
@@ -78,7 +79,7 @@ FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const a
 
 BalanceVjp balance_vjp(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& potential_bar,
                        const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
-  if (!is_incremental(e)) return {cotangent, {}};
+  if (!is_incremental(e, cotangent[0])) return {cotangent, {}};
   BalanceVjp found{change_back(e, cotangent, potential_bar, options, info), {}};
   const auto share = share_of_pressure(e);
   if (!change.defined() || !share.defined()) return found;

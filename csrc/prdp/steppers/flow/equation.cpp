@@ -9,6 +9,7 @@
 #include "prdp/error_text.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/sums_in_order.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/kernels.h"
 
 namespace prdp {
@@ -59,7 +60,7 @@ void check_wall(const FlowBox& box, size_t i, const at::Tensor& velocity) {
                     box.channel_of(axis), " must be 0");
 }
 
-/// Of one axis, which becomes the axis `place` of a state's: (d,) → (1, d, 1, …).
+/// A tensor of one axis with all axes of a state, its own at `place`: (d,) → (1, d, 1, …).
 at::Tensor with_all_axes(at::Tensor t, const at::Tensor& u, int64_t place = 1) {
   if (!t.defined()) return t;
   if (t.dim() == 1) {
@@ -76,10 +77,13 @@ double check_nu(const FlowEquation& e) {
   TORCH_CHECK_VALUE(e.nu.dim() <= 1, "Flow: nu must be a number, or a tensor of shape () or (batch or 1,), got ",
                     e.nu.sizes());
   const auto values = e.nu_values();
-  for (size_t i = 0; i < values.size(); ++i)
+  double largest = 0;
+  for (size_t i = 0; i < values.size(); ++i) {
     TORCH_CHECK_VALUE(std::isfinite(values[i]) && values[i] >= 0, "Flow: nu must be finite and >= 0, got ", values[i],
                       e.nu.dim() == 0 ? "" : c10::str(" at index ", i));
-  return e.largest_nu();
+    largest = std::max(largest, values[i]);
+  }
+  return largest;
 }
 
 }  // namespace
@@ -174,13 +178,7 @@ FlowEquation FlowEquation::for_state(const at::Tensor& u) const {
   return with_tensors(all);
 }
 
-std::vector<double> FlowEquation::nu_values() const {
-  const auto values = nu.detach().to(at::kCPU, at::kDouble).reshape({-1});
-  const auto of = values.accessor<double, 1>();
-  std::vector<double> found(of.size(0));
-  for (int64_t i = 0; i < of.size(0); ++i) found[i] = of[i];
-  return found;
-}
+std::vector<double> FlowEquation::nu_values() const { return to_host<double>(nu, nu.numel()); }
 
 double FlowEquation::largest_nu() const {
   double largest = 0;

@@ -9,6 +9,7 @@
 
 #include "prdp/kernels/loops.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/each_sample.h"
 
 namespace prdp {
@@ -75,21 +76,11 @@ void add_row_back(const AdvectionTerm<T>& t, const T* bars, T* c_bar, T* w_bar, 
   add(kHigh, edge + t.step);
 }
 
-/// ν of each sample.
-class SampleNumbers {
- public:
-  explicit SampleNumbers(const FlowEquation& e) : values_(e.nu_values()) {}
-  double operator[](int64_t sample) const { return values_[values_.size() == 1 ? 0 : sample]; }
-
- private:
-  std::vector<double> values_;
-};
-
 template <class T>
 void advect(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& out) {
   const GhostedGrid grid(*e.box);
   const int64_t d = e.box->dim(), cells = grid.cells();
-  const SampleNumbers nu(e);
+  const auto nu = to_host<double>(e.nu, padded.size(0));
   const T* given = padded.const_data_ptr<T>();
   T* result = out.mutable_data_ptr<T>();
   for_each_sample(out, [&](int64_t s) {
@@ -110,7 +101,7 @@ std::vector<double> advect_back(const FlowEquation& e, const at::Tensor& padded,
                                 const at::Tensor& bar) {
   const GhostedGrid grid(*e.box);
   const int64_t d = e.box->dim(), cells = grid.cells(), n = grid.n[2];
-  const SampleNumbers nu(e);
+  const auto nu = to_host<double>(e.nu, padded.size(0));
   const T *values = padded.const_data_ptr<T>(), *cotangents = g.const_data_ptr<T>();
   T* result = bar.mutable_data_ptr<T>();
   std::vector<double> nu_bars(g.size(0));
@@ -133,8 +124,9 @@ std::vector<double> advect_back(const FlowEquation& e, const at::Tensor& padded,
   return nu_bars;
 }
 
+/// max of dt Σ |u|/dx over the cells, in blocks that stay in the cache. NaN or Inf ends the search.
 template <class T>
-void find_courant_number(const FlowEquation& e, const T* u, int64_t cells, T* out) {
+T largest_courant_number(const FlowEquation& e, const T* u, int64_t cells) {
   constexpr int64_t block = 1024;
   std::array<T, block> sums;
   T largest = 0;
@@ -150,7 +142,7 @@ void find_courant_number(const FlowEquation& e, const T* u, int64_t cells, T* ou
     if (!(here <= largest)) largest = here;  // NaN too
     if (!std::isfinite(largest)) break;
   }
-  *out = largest;
+  return largest;
 }
 
 }  // namespace
@@ -181,7 +173,7 @@ at::Tensor courant_numbers_by_loops(const FlowEquation& equation, const at::Tens
     const auto* values = given.const_data_ptr<scalar_t>();
     auto* found = out.mutable_data_ptr<scalar_t>();
     const int64_t cells = GhostedGrid(*equation.box).cells(), d = equation.box->dim();
-    for_each_sample(u, [&](int64_t s) { find_courant_number(equation, values + s * d * cells, cells, found + s); });
+    for_each_sample(u, [&](int64_t s) { found[s] = largest_courant_number(equation, values + s * d * cells, cells); });
   });
   return out;
 }

@@ -7,6 +7,7 @@
 
 #include "prdp/error_text.h"
 #include "prdp/operators/operator.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/status.h"
 #include "prdp/solvers/warnings.h"
 #include "prdp/steppers/flow/tendency.h"
@@ -15,14 +16,14 @@ namespace prdp {
 
 namespace {
 
-/// The largest Courant number of each sample, or of all.
-std::vector<double> largest_courant_numbers(const FlowEquation& e) {
-  auto numbers = e.nu_values();
+/// The largest that the Courant number of each sample may be.
+std::vector<double> courant_limits(const FlowEquation& e, int64_t samples) {
+  auto numbers = to_host<double>(e.nu, samples);
   for (double& nu : numbers) nu = courant_limit(e).at(nu);
   return numbers;
 }
 
-/// What is not finite in sample i: the inflow that makes the boundary values of u, the force, a wall, or u.
+/// Says what is not finite in sample i: the inflow (before u, which holds its values), the force, a wall, or u.
 std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i) {
   const auto said = [](const std::string& name, const at::Tensor& bad) {
     return c10::str(name, " is not finite at index ", as_tuple(first_true(bad)));
@@ -43,8 +44,7 @@ std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i
 std::string growth_of_waves(const FlowEquation& e, const at::Tensor& u, int64_t sample) {
   const auto of_sample = u[sample].detach();
   const double square = of_sample.square().sum(0).max().item<double>();
-  const auto nu = e.nu_values();
-  const double longest = 2 * nu[nu.size() == 1 ? 0 : sample] / square;
+  const double longest = 2 * to_host<double>(e.nu, u.size(0))[sample] / square;
   if (e.advection != FlowAdvection::kCentral || !(longest < e.dt)) return {};
   return "; with central advection waves grow where dt > 2 nu/|u|², here " + three_digits(longest);
 }
@@ -61,12 +61,12 @@ gpu::CourantLimit courant_limit(const FlowEquation& e) {
 RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
   const at::NoGradGuard no_grad;
   const auto courant = courant_numbers(equation, u);
-  auto finite = at::ones_like(courant, at::kBool);  // all that is given but u
+  auto finite = at::ones_like(courant, at::kBool);  // the force and the walls; the inflow is in u
   auto given = equation.wall_velocity;
   given.push_back(equation.force);
   for (const auto& t : given)
     if (t.defined()) finite = finite.logical_and(t.isfinite().flatten(1).all(1));
-  const auto largest = at::tensor(largest_courant_numbers(equation), at::kDouble).to(courant.options());
+  const auto largest = at::tensor(courant_limits(equation, u.size(0)), at::kDouble).to(courant.options());
   const auto fine = courant.le(largest).logical_and_(courant.isfinite()).logical_and_(finite);
   if (fine.all().item<bool>()) return {};
   finite = finite.logical_and(u.isfinite().flatten(1).all(1));  // of a finite u, too, dt Σ |u|/dx may overflow
@@ -85,7 +85,7 @@ void report_refused(const FlowEquation& equation, const at::Tensor& u, const Ref
   if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;
   const auto courant = courant_numbers(equation, u);
   std::ostringstream text;
-  const auto largest = largest_courant_numbers(equation);
+  const auto largest = courant_limits(equation, u.size(0));
   const auto failed = refused.mask.nonzero().flatten();
   text << "Flow: " << failed.size(0) << " of " << u.size(0) << " samples failed";
   for (int64_t k = 0; k < std::min<int64_t>(failed.size(0), 4); ++k) {
@@ -95,7 +95,7 @@ void report_refused(const FlowEquation& equation, const at::Tensor& u, const Ref
     if (status == SolveStatus::kNonfiniteInput) text << ": " << nonfinite_part(equation, u, i);
     else
       text << ": dt Σ |u|/dx is " << courant[i].item<double>() << ", and the explicit advection needs at most "
-           << largest[largest.size() == 1 ? 0 : i] << "; take a smaller dt" << growth_of_waves(equation, u, i);
+           << largest[i] << "; take a smaller dt" << growth_of_waves(equation, u, i);
   }
   raise_or_warn(text.str(), on_failure);
 }

@@ -83,8 +83,8 @@ std::vector<int64_t> axes_of_ghosts(const FlowBox& box) {
   return axes;
 }
 
-/// What the velocity of a wall adds to the ghosts beyond it, twice itself: zero in the corners, beyond the ends of the
-/// axes that have their ghosts already. No difference reads the corners.
+/// The ghosts plus twice the velocity of the wall; zero is added in the corners, beyond the ends of the axes that have
+/// their ghosts already. No difference reads the corners.
 at::Tensor add_wall(const FlowEquation& equation, int64_t axis, bool high, const at::Tensor& ghosts) {
   const auto velocity = equation.velocity_of_wall(axis, high);
   if (!velocity.defined()) return ghosts;
@@ -94,7 +94,7 @@ at::Tensor add_wall(const FlowEquation& equation, int64_t axis, bool high, const
   return ghosts + 2 * at::constant_pad_nd(velocity, pads);
 }
 
-/// Its cotangent from that of the ghosts.
+/// The cotangent of the velocity of the wall from that of the ghosts.
 at::Tensor add_wall_back(const FlowEquation& equation, int64_t axis, bool high, at::Tensor ghosts) {
   const auto velocity = equation.velocity_of_wall(axis, high);
   if (!velocity.defined()) return velocity;
