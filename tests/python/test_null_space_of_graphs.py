@@ -59,6 +59,7 @@ def test_gradients_of_graphs_in_parts_are_those_of_the_pseudoinverse():
         torch.testing.assert_close(gradient, expected, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.alone
 def test_many_parts_cost_little():
     """A named null vector for each of 300 graphs: seconds, as every pair was multiplied."""
     parts, n = 300, 30
