@@ -29,7 +29,7 @@ demo: $(STAMPS)/configure
 	OMP_NUM_THREADS=1 $(BIN)/prdp compare diffusion_inverse
 
 # A test that hangs ends the run, with its stack and its name.
-ENDS := --max-worker-restart 0 -o faulthandler_timeout=600 -o faulthandler_exit_on_timeout=true
+ENDS := --max-worker-restart 0 -o faulthandler_timeout=1200 -o faulthandler_exit_on_timeout=true
 
 test: $(STAMPS)/configure
 	@echo "prdp: building library, trainer and tests (from scratch some 6 minutes on two cores)"
