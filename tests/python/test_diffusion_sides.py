@@ -149,7 +149,8 @@ def test_a_rise_above_the_values_at_the_sides(shape, boundary):
 
 
 @pytest.mark.parametrize("values, words", [
-    ((1.0, 2.0), r"or a pair \(low, high\) for each of 2 axes, \(None, None\) for one without, got \(1.0, 2.0\)"),
+    ((1.0, 2.0), r"values must be a number, a tensor, or a pair \(low, high\) for each of 2 axes, "
+     r"\(None, None\) for one without, got \(1.0, 2.0\)"),
     (torch.ones(1, 7), r"values must broadcast to \(batch or 1, \*side\), here \(1, 5\), got \(1, 7\)"),
     (torch.ones(7), r"values must broadcast to \(batch or 1, \*side\), here \(1, 5\), got \(7,\)"),
 ])  # fmt: skip

@@ -86,7 +86,7 @@ def test_gradients_against_finite_differences(name):
 
     def loss(nu):
         step = flow(name, F64, nu, given(name, F64, ALL))
-        return (weights * step(step(u))).sum((1, 2, 3) if u.dim() == 4 else (1, 2, 3, 4))
+        return (weights * step(step(u))).flatten(1).sum(1)
 
     nu = viscosities(name).requires_grad_()
     torch.autograd.gradcheck(loss, nu, atol=1e-6, rtol=1e-4, eps=1e-7)
@@ -136,6 +136,13 @@ def test_a_network_sets_it_in_each_update():
     step.nu = network(noise(3, 4, dtype=F32))[:, 0]
     step.rollout(step.project(u), 3).square().sum().backward()
     assert all(p.grad.isfinite().all() and p.grad.any() for p in network.parameters())
+
+
+def test_a_nu_that_is_true_is_one():
+    u = start("periodic").requires_grad_()
+    steps = [prdp.Flow(u.shape[2:], nu, 0.01) for nu in (torch.tensor([True]), 1.0)]
+    grads = [torch.autograd.grad(step(u).square().sum(), u)[0] for step in steps]
+    torch.testing.assert_close(*grads, rtol=1e-12, atol=1e-13)
 
 
 def test_a_batch_without_samples():

@@ -5,14 +5,9 @@ import math
 import pytest
 import torch
 from flows import positions
+from test_gpu_flow import F64, noise
 
 import prdp_torch as prdp
-
-F64 = torch.float64
-
-
-def noise(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=F64)
 
 
 def mirrored(u, boundary, length):

@@ -24,6 +24,7 @@ using torch::autograd::variable_list;
 /// What travels from the forward to the backward pass beside tensors.
 struct Call : torch::CustomClassHolder {
   FlowEquation equation;
+  std::vector<bool> has{};  // which of its tensors the equation has
   int64_t steps;
   FlowOutput output;
   SolveOptions options;
@@ -38,17 +39,17 @@ enum Saved : size_t {
   kTensors,  // from here on, those of the equation
 };
 
-/// Functions of autograd take no undefined tensors: one of bools, which no equation has, stands for none.
-std::vector<at::Tensor> or_bools(std::vector<at::Tensor> tensors, const at::Tensor& u) {
+/// Functions of autograd take no undefined tensors: an empty one stands for none.
+std::vector<at::Tensor> or_empty(std::vector<at::Tensor> tensors, const at::Tensor& u) {
   for (auto& t : tensors)
-    if (!t.defined()) t = at::empty({0}, u.options().dtype(at::kBool));
+    if (!t.defined()) t = at::empty({0}, u.options());
   return tensors;
 }
-std::vector<at::Tensor> or_undefined(at::TensorList given) {
-  auto tensors = given.vec();
-  for (auto& t : tensors)
-    if (t.scalar_type() == at::kBool) t = at::Tensor();
-  return tensors;
+FlowEquation equation_of(const Call& call, at::TensorList or_empty) {
+  auto tensors = or_empty.vec();
+  for (size_t i = 0; i < tensors.size(); ++i)
+    if (!call.has[i]) tensors[i] = at::Tensor();
+  return call.equation.with_tensors(tensors);
 }
 
 /// What is asked for, and the reports of the steps.
@@ -66,11 +67,11 @@ SolveResult forward_steps(const FlowEquation& equation, const at::Tensor& u, int
 
 class FlowSteps : public torch::autograd::Function<FlowSteps> {
  public:
-  /// `tensors`: those of the equation, or_bools().
+  /// `tensors`: those of the equation, empty ones for none.
   static variable_list forward(AutogradContext* ctx, const at::Tensor& u, at::TensorList tensors,
                                const c10::intrusive_ptr<Call>& call) {
     const at::AutoDispatchBelowADInplaceOrView below;
-    const auto equation = call->equation.with_tensors(or_undefined(tensors));
+    const auto equation = equation_of(*call, tensors);
     const auto [out, info] = forward_steps(equation, u, call->steps, call->output, call->options);
     ctx->mark_non_differentiable({info.iterations, info.residual, info.status, info.operator_applications, info.floor});
     ctx->set_materialize_grads(false);
@@ -89,7 +90,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     const auto tensors = at::TensorList(saved).slice(kTensors);
     variable_list out(tensors.size() + 2);
     if (!grads[0].defined()) return out;
-    const auto equation = call->equation.with_tensors(or_undefined(tensors));
+    const auto equation = equation_of(*call, tensors);
     std::vector<int64_t> needed(tensors.size() + 1);
     for (size_t i = 0; i < needed.size(); ++i) needed[i] = ctx->needs_input_grad(i);
     const auto of_cotangent = [&](const at::Tensor& cotangent) {
@@ -182,7 +183,9 @@ SolveResult flow_steps(const FlowEquation& equation, const at::Tensor& u, int64_
     return forward_steps(equation, u.detach(), steps, output, options);
   }
   auto call = c10::make_intrusive<Call>();
-  const auto tensors = or_bools(with_gradients_along_walls(equation).tensors(), u);
+  const auto given = with_gradients_along_walls(equation).tensors();
+  for (const auto& t : given) call->has.push_back(t.defined());
+  const auto tensors = or_empty(given, u);
   call->equation = equation.with_tensors(std::vector<at::Tensor>(tensors.size()));
   call->steps = steps;
   call->output = output;
