@@ -149,8 +149,8 @@ SparseFactors::SparseFactors(const Triplets& entries, int64_t n, const Pins& pin
     : kept_unknowns_(places(n, pins.unknowns)), kept_equations_(places(n, pins.equations)) {
   const auto size = n - static_cast<int64_t>(pins.unknowns.size());
   Triplets kept;
-  for (const auto& e : entries)
-    if (kept_equations_[e.row()] >= 0 && kept_unknowns_[e.col()] >= 0)
+  for (const auto& e : entries)  // zeros, such as those between the columns of a field, would fill in
+    if (e.value() != 0.0 && kept_equations_[e.row()] >= 0 && kept_unknowns_[e.col()] >= 0)
       kept.emplace_back(kept_equations_[e.row()], kept_unknowns_[e.col()], e.value());
   auto m = std::make_shared<Matrix>(size, size);
   m->setFromTriplets(kept.begin(), kept.end());
