@@ -2,7 +2,7 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'FunctionCode', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'any_nonfinite', 'batched_axes', 'block_gradients_of_failed', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'warn', 'way_of_last_solve']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'FunctionCode', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'any_nonfinite', 'batched_axes', 'block_gradients_of_failed', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'warn', 'warn_of_idle_steps', 'way_of_last_solve']
 class FunctionCode:
     def __init__(self) -> None:
         ...
@@ -169,6 +169,10 @@ def step(u: typing.Any, tensors: collections.abc.Sequence[typing.Any], equation:
 def warn(text: str) -> None:
     """
     Warn, at the line of the user's that led here.
+    """
+def warn_of_idle_steps(iterations: torch.Tensor, residual: torch.Tensor, status: torch.Tensor, rtol: typing.SupportsFloat | typing.SupportsIndex, on_failure: str) -> None:
+    """
+    Warn where the steps of a rollout, (batch, steps), hand their start on.
     """
 def way_of_last_solve() -> str:
     """

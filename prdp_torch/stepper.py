@@ -214,6 +214,8 @@ class Stepper(HasSettings):
         if u.requires_grad and (compiling or self._last_log is not log):
             self._last_log = log
         kept = None if report is None else outlive_transforms(report)
+        if kept is not None and kept[0].dim() == 2 and not compiling:
+            _C.warn_of_idle_steps(*kept[:3], self.rtol, self.on_failure)
         if kept is None:
             info = None
         else:  # if nothing was solved, way_of_last_solve() would describe an earlier solve

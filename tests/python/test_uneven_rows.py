@@ -110,3 +110,46 @@ def test_jumps_of_kappa_say_nothing_where_u_is_right(contrast, solver, always):
     exact, _ = prdp.linear_solve(a, b, prdp.Direct())
     (u, _), said = warnings_of(lambda: prdp.linear_solve(a, b, solver))
     assert not said and (u - exact).abs().max() < 1e-2 * exact.abs().max()
+
+
+@pytest.mark.parametrize("start", [False, True])
+@pytest.mark.parametrize("solver", [prdp.CG(500), prdp.CG(50, preconditioner="multigrid")], ids=repr)
+def test_a_small_channel_beside_a_large_one_is_said(solver, start, always):
+    n, dt = 24, 10.0
+    y, x = torch.meshgrid(*[(torch.arange(n, dtype=F64) + 0.5) / n] * 2, indexing="ij")
+    salt = 35 + 1e-4 * torch.cos(torch.pi * x)
+    gas = 1e-3 * torch.exp(-((x - 0.3) ** 2 + (y - 0.4) ** 2) / 0.01)
+    b = torch.stack([salt, gas])[None]
+    a = operators.Diffusion(torch.full((1, n, n), 1e-3 * dt, dtype=F64), shift=1.0, boundary="flux")
+    (found, info), said = warnings_of(lambda: prdp.linear_solve(a, b, solver, x0=b if start else None))
+    assert info.solved.all()
+    exact, _ = prdp.linear_solve(a, b, prdp.Direct())
+    off = (found - exact)[0, 1].norm() / exact[0, 1].norm()
+    assert len(said) == (off > 2e-3) and (start or solver.preconditioner or off > 1)
+    assert all("in channel 1 alone |b - A u| is" in text and "flatten(0, 1)" in text for text in said)
+    apart = b.flatten(0, 1).unsqueeze(1)
+    (as_samples, _), said = warnings_of(lambda: prdp.linear_solve(a, apart, solver, x0=apart if start else None))
+    assert not said and (as_samples[1, 0] - exact[0, 1]).norm() < 1e-3 * exact[0, 1].norm()
+
+
+def test_a_channel_of_rounding_says_nothing(always):
+    a = operators.Diffusion(torch.ones(1, 16, 16, dtype=F64), shift=1.0)
+    b = torch.ones(2, 2, 16, 16, dtype=F64)
+    b[:, 1] *= 1e-16
+    b[1, 1] = 0
+    assert not warnings_of(lambda: prdp.linear_solve(a, b, prdp.CG(200)))[1]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64], ids=["float32", "float64"])
+def test_small_rows_beside_those_of_the_identity(dtype, always):
+    """Of an island whose values are given; GMRES ends by a breakdown in float32."""
+    n, c = 32, 1e-9
+    water = torch.ones(1, n, n, dtype=F64)
+    water[0, 10:15, 5:15] = 0
+    rows = torch.stack([torch.where(water > 0, 4 * c, 1.0), *[-c * water] * 4], 1).to(dtype)
+    a = operators.Stencil(rows, [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)])
+    b = (1e4 * (1 - water) + 1e-5 * water)[:, None].to(dtype)
+    exact, _ = prdp.linear_solve(a, b, prdp.Direct())
+    (u, info), said = warnings_of(lambda: prdp.linear_solve(a, b, prdp.GMRES(100, restart=30)))
+    assert info.solved.all() and len(said) == 1 and "u is off by at least about" in said[0]
+    assert ((u - exact) * water[:, None]).abs().max() > 0.5 * (exact * water[:, None]).abs().max()

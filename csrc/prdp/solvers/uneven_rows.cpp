@@ -32,9 +32,9 @@ at::Tensor size_of_rows(const Operator& a, const at::Tensor& like) {
 
 /// An approximate lower bound of the error at each point of a small row, as a share of the largest |u|:
 /// |r_i| / (‖a_i‖ max |u|).
-at::Tensor shares_of_error(const Operator& a, const at::Tensor& b, const at::Tensor& u) {
+at::Tensor shares_of_error(const Operator& a, const at::Tensor& b, const at::Tensor& u, const at::Tensor& residual) {
   constexpr double much_larger = 10.0;
-  const auto left = a.project(b - apply_on_loops(a, u, /*transposed=*/false)).abs().to(at::kDouble);
+  const auto left = residual.abs().to(at::kDouble);
   const auto rows = size_of_rows(a, b).to(at::kDouble);
   const auto largest = per_sample(sample_maxima(rows), b), size = per_sample(sample_maxima(u), b);
   const auto tells = rows.gt(0) & (rows * much_larger).lt(largest) & size.gt(0);
@@ -44,35 +44,80 @@ at::Tensor shares_of_error(const Operator& a, const at::Tensor& b, const at::Ten
 /// Rows of these differ at the boundary alone: there is no need to look.
 bool has_even_rows(const OperatorSpec& a) { return a.kind == "poisson" || a.kind == "heat"; }
 
+/// Whether b has channels that A takes apart.
+bool has_channels_apart(const OperatorSpec& a, const at::Tensor& b) {
+  const bool couples = a.kind == "burgers" || a.kind == "navier_stokes" || is_function(a);
+  return !couples && b.dim() > 2 && b.size(1) > 1;
+}
+
+/// Where the solve with `role` had the `residual` b - A u.
+struct Look {
+  const SolveRole& role;
+  const at::Tensor &b, &u, &residual;
+  at::Tensor converged;
+
+  std::string beginning(int64_t sample) const {
+    return c10::str(role.adjoint ? "adjoint solve" : "linear_solve", ": sample ", sample,
+                    " CONVERGED to rtol = ", role.solver.rtol, ", but ");
+  }
+  std::string key(const char* what) const { return c10::str(what, role.a.kind, role.adjoint, b.sizes().slice(1)); }
+  double much() const { return std::max(1e-3, 100.0 * role.solver.rtol); }
+};
+
+void warn_of_small_channels(const Look& look) {
+  const auto norms = [](const at::Tensor& v) { return v.flatten(2).norm(2, 2, /*keepdim=*/false, at::kDouble); };
+  const auto of_b = norms(look.b), of_all = of_b.amax(1, /*keepdim=*/true);
+  const auto is_there = of_b > 100.0 * epsilon_of(look.b) * of_all;  // less is rounding
+  const auto shares =
+      at::where(is_there, norms(look.residual) / of_b, 0.0).masked_fill(look.converged.logical_not().unsqueeze(1), 0.0);
+  const auto worst = shares.argmax().item<int64_t>(), channels = shares.size(1);
+  const double share = shares.flatten()[worst].item<double>();
+  if (!(share > look.much())) return;
+  warn_once(look.key("small channels"), share, [&](std::ostream& text) {
+    text << look.beginning(worst / channels) << "in channel " << worst % channels << " alone |b - A u| is "
+         << three_digits(share) << " |b|: its b is much smaller than that of another channel, and all channels have "
+         << "one stopping test. Solve them as samples, as with b.flatten(0, 1).unsqueeze(1), or take "
+         << in_language("Direct()", "Direct{}");
+  });
+}
+
+void warn_of_small_rows(const Look& look, const Operator& a) {
+  const double rtol = look.role.solver.rtol;
+  const auto shares = shares_of_error(a, look.b, look.u, look.residual);
+  const auto worst_of = shares.flatten(1).amax(1).masked_fill(look.converged.logical_not(), 0.0);
+  const auto i = worst_of.argmax().item<int64_t>();
+  const double worst = worst_of[i].item<double>();
+  if (!(worst > look.much())) return;
+  warn_once(look.key("uneven rows "), worst, [&](std::ostream& text) {
+    const auto place = shares[i].eq(worst);
+    text << look.beginning(i) << "u is off by at least about " << three_digits(100.0 * worst)
+         << " % of its largest entry at index " << as_tuple(first_true(place))
+         << ": other rows of A, such as those of a penalty, are much larger and make up ‖b‖. Take "
+         << in_language("Direct()", "Direct{}");
+    const double enough = rtol * (rtol / worst);  // the error falls with rtol, here to about rtol
+    if (enough > 100.0 * epsilon_of(look.b)) text << " or a smaller rtol, such as " << three_digits(enough);
+  });
+}
+
 }  // namespace
 
 void warn_of_uneven_rows(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveResult& result) {
   const auto& solver = role.solver;
-  const double rtol = solver.rtol;
-  if (!(rtol > 0.0) || traits(solver.method).is_direct || is_function(role.a) || has_even_rows(role.a)) return;
+  const bool looks_at_rows = !is_function(role.a) && !has_even_rows(role.a);
+  const bool looks_at_channels = has_channels_apart(role.a, b);
+  if (!(solver.rtol > 0.0) || traits(solver.method).is_direct || (!looks_at_rows && !looks_at_channels)) return;
   if (!b.is_cpu() || gpu::runtime_of(b.device()) || b.numel() == 0 || !is_plain(b) || !all_plain(role.a.tensors))
     return;
   if (!should_look(c10::get_hash(role.a.kind, role.adjoint, static_cast<int>(solver.method), b.sizes().slice(1).vec())))
     return;
   const at::NoGradGuard no_grad;
-  const auto converged = result.info.status.eq(static_cast<int64_t>(SolveStatus::kConverged));
-  const auto shares = shares_of_error(a, b, result.u);
-  const auto worst_of = shares.flatten(1).amax(1).masked_fill(converged.logical_not(), 0.0);
-  const auto i = worst_of.argmax().item<int64_t>();
-  const double worst = worst_of[i].item<double>();
-  if (!(worst > std::max(1e-3, 100.0 * rtol))) return;
-  std::ostringstream key;
-  key << "uneven rows " << role.a.kind << role.adjoint << b.sizes().slice(1);
-  warn_once(key.str(), worst, [&](std::ostream& text) {
-    const auto place = shares[i].eq(worst);
-    text << (role.adjoint ? "adjoint solve" : "linear_solve") << ": sample " << i << " CONVERGED to rtol = " << rtol
-         << ", but u is off by at least about " << three_digits(100.0 * worst) << " % of its largest entry at index "
-         << as_tuple(first_true(place))
-         << ": other rows of A, such as those of a penalty, are much larger and make up ‖b‖. Take "
-         << in_language("Direct()", "Direct{}");
-    const double enough = rtol * (rtol / worst);  // the error falls with rtol, here to about rtol
-    if (enough > 100.0 * epsilon_of(b)) text << " or a smaller rtol, such as " << three_digits(enough);
-  });
+  const auto& status = result.info.status;
+  const auto is = [&](SolveStatus of) { return status.eq(static_cast<int64_t>(of)); };
+  const auto residual = a.project(b - apply_on_loops(a, result.u, /*transposed=*/false));
+  const Look look{role, b, result.u, residual,
+                  is(SolveStatus::kConverged).logical_or(is(SolveStatus::kConvergedBreakdown))};
+  if (looks_at_channels) warn_of_small_channels(look);
+  if (looks_at_rows) warn_of_small_rows(look, a);
 }
 
 }  // namespace prdp

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "prdp/solvers/solver.h"
+#include "prdp/steppers/idle_steps.h"
 
 namespace prdp {
 
@@ -47,6 +48,7 @@ class StepperBase {
     info_.reset();
     check_state(u);
     auto [next, info] = solve();
+    warn_of_idle_steps(info, options_.solver.rtol, options_.on_failure);
     info_ = std::move(info);
     return next;
   }

@@ -1,0 +1,75 @@
+"""A rollout whose steps hand their start on says so."""
+
+import warnings
+
+import pytest
+import torch
+
+import prdp_torch as prdp
+
+F64 = torch.float64
+N, DT = 40, 1e-7
+X = (torch.arange(N, dtype=F64) + 0.5) / N
+A = prdp.operators.Diffusion(torch.ones(1, N, dtype=F64), shift=1 / DT, boundary="flux")
+WAVE = (1 + 0.5 * torch.cos(2 * torch.pi * X)).expand(3, 1, N)  # two waves: the start is scaled as suits best
+
+
+def said(call):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = call()
+    return found, [str(w.message) for w in caught if "took no iteration" in str(w.message)]
+
+
+def step(solver=None, **options):
+    return prdp.ImplicitStep(A, lambda u: u / DT, solver or prdp.CG(100), **options)
+
+
+def heat(**options):
+    """A stepper whose rollout is one node."""
+    return prdp.Heat((N,), nu=1.0, dt=DT, solver=prdp.CG(100), **options)
+
+
+ZEROS_AT_ENDS = torch.sin(torch.pi * X) + 0.5 * torch.sin(3 * torch.pi * X)
+STARTS = {step: WAVE, heat: ZEROS_AT_ENDS.expand(3, 1, N)}
+
+
+@pytest.mark.parametrize("make", [step, heat])
+def test_short_steps_from_the_state_are_said_with_what_they_leave_out(make, always):
+    u = STARTS[make]
+    states, told = said(lambda: make(start="state").rollout(u, 1000))
+    _, silent = said(lambda: make(start="zero").rollout(u, 1000))
+    tight = make(start="state")
+    tight.rtol = 1e-12
+    exact = tight.rollout(u, 1000)
+    change = (exact[:, -1] - u).norm(dim=(1, 2)) / u.norm(dim=(1, 2))
+    assert not silent and (states[:, -1] - u).norm() < 0.5 * (exact[:, -1] - u).norm()
+    assert len(told) == 1 and "1000 of 1000 steps took no iteration" in told[0] and 'start="zero"' in told[0]
+    lost = float(told[0].split("as much as ")[1].split(" ")[0])
+    assert 0.2 * change.max() < lost < 3 * change.max()
+    rtol = float(told[0].split("such as ")[1].split(",")[0])
+    tight.rtol = rtol
+    found, silent = said(lambda: tight.rollout(u, 1000))
+    assert not silent and (found[:, -1] - exact[:, -1]).norm() < 0.05 * (exact[:, -1] - u).norm()
+
+
+def test_others_say_nothing(always):
+    assert not said(lambda: step(start="state").rollout(WAVE, 7))[1]  # few steps
+    assert not said(lambda: step(start="zero").rollout(WAVE, 100))[1]
+    assert not said(lambda: step(start="state", on_failure="return").rollout(WAVE, 1000))[1]
+    assert not said(lambda: step(prdp.CG(100, rtol=1e-2), start="state").rollout(WAVE, 1000))[1]  # a controller's
+    assert not said(lambda: step(start="state").rollout(torch.ones_like(WAVE), 1000))[1]  # nothing is left out
+
+
+def test_a_march_towards_a_steady_state_says_nothing(always):
+    kappa = torch.ones(1, N, dtype=F64)
+    march = prdp.ImplicitStep(
+        prdp.operators.Diffusion(kappa, shift=1.0), lambda u: u + 1.0, prdp.CG(100), start="state"
+    )
+    states, told = said(lambda: march.rollout(torch.zeros(1, 1, N, dtype=F64), 100))
+    assert (march.info.iterations[:, -50:] == 0).all() and not told
+    assert (states[:, -1] - states[:, -2]).abs().max() == 0
+
+
+def test_it_is_said_once():
+    assert sum(len(said(lambda: step(start="state").rollout(WAVE, 2000))[1]) for _ in range(3)) <= 1
