@@ -193,3 +193,48 @@ def test_a_scheme_that_keeps_the_mean_is_singular_as_its_transpose_tells():
     assert torch.linalg.svdvals(a.dense().reshape(n, n))[-1] < 1e-12
     with pytest.raises(ValueError, match=r"A\^T maps the constant to zero, so A is singular: give left_nullspace="):
         prdp.check_operator(a, torch.zeros(1, 1, n, dtype=torch.float64))
+
+
+def device(psi, density):
+    """Of a potential of some tens beside a density of any size: the product is exponential in the former."""
+    d = psi.diff(dim=1)
+    flux = density[:, 1:] * torch.exp(-d / 2) - density[:, :-1] * torch.exp(d / 2)
+    pad = torch.nn.functional.pad
+    return psi - 0.3 * psi.roll(1, 1), density - pad(flux, (0, 1)) + pad(flux, (1, 0))
+
+
+@pytest.mark.parametrize("top", [1e2, 1e6, 1e10])
+@pytest.mark.parametrize("loses_psi", [False, True])
+def test_a_tensor_may_hold_numbers_of_any_sizes(top, loses_psi):
+    n = 20
+    psi = torch.linspace(0, 1, n, dtype=torch.float64) * torch.log(torch.tensor(top))
+    u = torch.cat([psi, psi.exp()])[None].repeat(2, 1).requires_grad_()
+
+    def product(v, u):
+        at = u[:, :n].detach() if loses_psi else u[:, :n]
+        parts = torch.func.jvp(device, (at, u[:, n:]), (v[:, :n], v[:, n:]))[1]
+        return torch.cat(parts, 1)
+
+    a = operators.Function(product, tensors=(u,))
+    if loses_psi:
+        with pytest.raises(ValueError, match=r"the gradient for tensor 0 of shape .* is wrong"):
+            prdp.check_operator(a, torch.zeros(2, 2 * n, dtype=torch.float64))
+    else:
+        assert prdp.check_operator(a, torch.zeros(2, 2 * n, dtype=torch.float64))
+
+
+def test_null_vectors_that_nobody_named_are_counted():
+    """Three graphs in one matrix, each with its constant."""
+    one = 5 * torch.eye(5, dtype=torch.float64) - 1
+    three = torch.block_diag(one, 2 * one, 1e6 * one)
+    vectors = torch.block_diag(*[torch.ones(1, 5, dtype=torch.float64)] * 3)
+    example = torch.zeros(2, 15, dtype=torch.float64)
+    assert prdp.check_operator(operators.Matrix(three, nullspace=vectors), example)
+    with pytest.raises(ValueError, match="A of sample 0 maps 2 vectors to zero that nullspace does not name"):
+        prdp.check_operator(operators.Matrix(three, nullspace="constant"), example)
+    with pytest.raises(ValueError, match="maps 1 vectors to zero that nullspace does not name"):
+        prdp.check_operator(operators.Matrix(three, nullspace=vectors[:2]), example)
+    both = torch.stack([three, torch.block_diag(one, torch.eye(10, dtype=torch.float64))])
+    of_samples = torch.stack([vectors, vectors * torch.tensor([[1.0], [0.0], [0.0]])])
+    assert prdp.check_operator(operators.Matrix(both, nullspace=of_samples), example)
+    assert prdp.check_operator(operators.Matrix(torch.diag(10.0 ** torch.arange(0, -15, -1).double())), example)
