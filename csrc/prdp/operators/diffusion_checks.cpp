@@ -143,7 +143,7 @@ void DiffusionOperator::check_kappa(Checks checks) const {
   const double value = kappa_.masked_select(wrong)[0].item<double>();
   TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ", value, " in sample ", index[0], " at index ",
                     as_tuple(at::IntArrayRef(index).slice(per_axis_ ? 1 : 2)),
-                    value == 0.0 ? "; where nothing flows, give a small number such as 1e-30" : "");
+                    value == 0.0 ? "; where nothing flows, give 1e-12 times a typical one" : "");
 }
 
 std::optional<DiffusionOperator::Refused> DiffusionOperator::first_refused(int64_t sample) const {
