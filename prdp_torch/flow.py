@@ -44,7 +44,8 @@ class Flow(HoldsTensors, Stepper):
             "slip": the same without friction, as at a plane of symmetry or a calm surface.
             "open": `inflow` at the low end; at the high end pressure zero and no normal gradient. At most one axis.
         length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/N.
-        obstacle: bool (*shape), True in solid cells. Their faces carry no velocity.
+        obstacle: bool (*shape), or (batch or 1, *shape) for one of each sample, True in solid cells. Their faces carry
+            no velocity.
         force: acceleration, (d,) or (batch or 1, d, *shape).
         inflow: velocity at the low end of the open axis, (d,), or (batch or 1, d, *shape) with extent 1 along it.
         wall_velocity: the velocity of walls that move along themselves: a dict from a side, such as (0, "high"), to a

@@ -15,7 +15,7 @@ class Matrix(Operator):
     """A matrix: a tensor (n, n) or (batch, n, n), dense or sparse CSR. A sparse one gets gradients on its pattern; if
     you need them, use `Matrix.csr`, because torch may make the gradient of a CSR tensor dense.
 
-    `nullspace` and `left_nullspace` are those of `Stencil`: "constant" or vectors (k, n)."""
+    `nullspace` and `left_nullspace` are those of `Stencil`: "constant" or vectors (k, n), or (batch, k, n)."""
 
     is_sparse_parameter = False
 
@@ -89,7 +89,7 @@ class Matrix(Operator):
             values: (nnz,), or (batch, nnz) for a matrix per sample on one pattern; float32 or float64. The
                 gradient arrives here, in this shape.
             size: (n, n) or n; (batch, n, n) with values (batch, nnz).
-            nullspace, left_nullspace: "constant" or vectors (k, n), as for `Stencil`.
+            nullspace, left_nullspace: "constant" or vectors (k, n), or (batch, k, n), as for `Stencil`.
 
         Raises TypeError or ValueError where the shapes do not fit each other.
         """

@@ -30,9 +30,10 @@ class Stencil(Operator):
         offsets: k tuples of whole numbers, one entry for each axis of shape, at most two cells along each.
         boundary: "zero" (v is 0 outside the grid) or "periodic", one for all axes or one for each.
         nullspace: what A maps to zero, where it is singular: "constant" (in each channel), vectors (k, *shape) for each
-            channel, or vectors (k, channels, *shape) of all channels together. Then b, u and cotangents are taken
-            without their part there, and a b that has one beyond rtol is INCONSISTENT. Vectors may depend on
-            parameters: the gradients are those of the pseudo-inverse.
+            channel, vectors (k, channels, *shape) of all channels together, or these for each sample, (batch, k,
+            channels, *shape), with zeros where a sample has fewer. Then b, u and cotangents are taken without their
+            part there, and a b that has one beyond rtol is INCONSISTENT. Vectors may depend on parameters: the
+            gradients are those of the pseudo-inverse.
         left_nullspace: what Aᵀ maps to zero, as many vectors. None takes those of nullspace, as for symmetric A.
 
     Raises:

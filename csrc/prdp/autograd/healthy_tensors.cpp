@@ -60,7 +60,8 @@ OperatorSpec with_healthy_tensors(OperatorSpec a, const Rows& take_part) {
 OperatorSpec with_ones_where_refused(OperatorSpec a, const at::Tensor& status) {
   if (!knows_axes(a)) return a;
   const auto refused = is_refused(status);
-  for (size_t k = 0; k < a.tensors.size(); ++k)
+  const size_t bases = is_singular(a) ? 2 : 0;  // of null spaces: ones would depend on each other
+  for (size_t k = 0; k + bases < a.tensors.size(); ++k)
     if (auto& t = a.tensors[k]; t.is_floating_point() && is_of_samples(a, k, status.size(0)))
       t = t.masked_fill(per_sample(refused, t).to(t.device()), 1.0);
   return a;

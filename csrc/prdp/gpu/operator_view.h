@@ -16,7 +16,8 @@ struct OperatorView {
   /// Contiguous, with one sample or as many as the vectors, or one axis, for all of them; undefined: there is none.
   std::vector<at::Tensor> tensors{};
   std::vector<double> numbers{};
-  /// Orthonormal vectors of one field, (count, length); without entries: the constant one; undefined: no null space.
+  /// Orthonormal vectors of one field, (count, length), or (batch or 1, count, length) with zeros where a sample has
+  /// fewer; without entries: the constant one; undefined: no null space.
   at::Tensor null_space{}, left_null_space{};
   int64_t null_field = -1;  // the one channel that these belong to; -1: each has its own
   bool needs_projection = false;       // Operator::needs_projection()

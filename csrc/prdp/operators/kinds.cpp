@@ -49,11 +49,11 @@ const OperatorKind& operator_kind(const std::string& kind) {
 std::optional<std::vector<int64_t>> batched_axes(const std::string& kind, int64_t axes, size_t tensors) {
   auto of_tensors = operator_kind(kind).batched_axes;
   if (!of_tensors) return std::nullopt;
-  const size_t bases = is_singular(kind) ? 2 : 0;  // of null spaces, which all samples share
+  const size_t bases = is_singular(kind) ? 2 : 0;
   if (!of_tensors->empty()) of_tensors->resize(tensors - bases, of_tensors->back());
   for (auto& n : *of_tensors)
     if (n < 0) n += axes - kLikeSide;  // a side, the lowest constant, has `axes` with the batch; each above it one more
-  of_tensors->resize(of_tensors->size() + bases, 0);
+  of_tensors->resize(of_tensors->size() + bases, axes + 3);  // of null spaces: as a vector, behind how many there are
   return of_tensors;
 }
 

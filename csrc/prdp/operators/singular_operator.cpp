@@ -19,23 +19,33 @@ namespace prdp {
 
 namespace {
 
-/// Orthonormal vectors in double by Gram and Schmidt, twice.
+/// Orthonormal vectors in double by Gram and Schmidt, twice. `rows`: (k, n), or (batch, k, n), where a vector of zeros
+/// remains.
 at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
+  const bool of_samples = rows.dim() == 3;
   std::vector<at::Tensor> done;
-  const bool are_apart = rows.ne(0).sum(0).le(1).all().item<bool>();  // such as those of the parts of a graph
-  for (int64_t k = 0; k < rows.size(0); ++k) {
-    auto q = rows[k];
-    const auto whole = q.norm();
+  const bool are_apart = rows.ne(0).sum(-2).le(1).all().item<bool>();  // such as those of the parts of a graph
+  for (int64_t k = 0; k < rows.size(-2); ++k) {
+    auto q = rows.select(-2, k);
+    const auto whole = q.norm(2, -1, /*keepdim=*/true);
     for (int pass = 0; pass < 2 && !are_apart; ++pass)
-      for (const auto& other : done) q = q - other.dot(q) * other;
-    const auto left = q.norm();
+      for (const auto& other : done) q = q - (other * q).sum(-1, /*keepdim=*/true) * other;
+    const auto left = q.norm(2, -1, /*keepdim=*/true);
     constexpr double independent = 1e-6;
-    TORCH_CHECK_VALUE((left > independent * whole).item<bool>(), title, ": vector ", k,
-                      " of a null space is zero, not finite, or depends on those before it");
-    done.push_back(q / left);
+    const auto remains = of_samples ? whole.eq(0) : at::zeros_like(whole, at::kBool);
+    const auto wrong = (left > independent * whole).logical_or(remains).logical_not();
+    if (wrong.any().item<bool>())
+      TORCH_CHECK_VALUE(
+          false, title, ": vector ", k, " of a null space",
+          of_samples ? c10::str(" of sample ", wrong.flatten().to(at::kLong).argmax().item<int64_t>()) : "",
+          " is zero, not finite, or depends on those before it");
+    done.push_back(q / left.masked_fill(remains, 1.0));
   }
-  return at::stack(done);
+  return at::stack(done, -2);
 }
+
+/// The vectors of a basis as the rows of a matrix, (k, n) or (batch, k, n).
+at::Tensor rows_of(const at::Tensor& basis, bool of_samples) { return basis.flatten(of_samples ? 2 : 1); }
 
 }  // namespace
 
@@ -57,9 +67,16 @@ SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSp
       left_{spec.tensors.back().detach(), {}},
       needs_derivative_(any_needs_derivative(at::TensorList(spec.tensors).slice(spec.tensors.size() - 2))),
       title_(operator_kind(spec.kind).title) {
-  TORCH_CHECK_VALUE(right_.count() == left_.count(), title_,
-                    ": nullspace and left_nullspace must hold as many vectors, got ", right_.count(), " and ",
-                    left_.count());
+  // Whether they are of each sample is known beside a vector, where check_vector() looks again.
+  const auto has_axes = [](const Basis& basis) { return basis.given.dim() > 2; };
+  const bool both = has_axes(right_) && has_axes(left_), any = has_axes(right_) || has_axes(left_);
+  if (both ? right_.given.sym_size(1) != left_.given.sym_size(1) : !any)
+    check_counts(right_.count(/*axis=*/0), left_.count(0));
+}
+
+void SingularOperator::check_counts(const c10::SymInt& right, const c10::SymInt& left) const {
+  TORCH_CHECK_VALUE(right == left, title_, ": nullspace and left_nullspace must hold as many vectors, got ", right,
+                    " and ", left);
 }
 
 at::Tensor by_vector(const at::Tensor& v, bool spans_channels) {
@@ -69,10 +86,12 @@ at::Tensor by_vector(const at::Tensor& v, bool spans_channels) {
 at::Tensor follow_null_space(const at::Tensor& u, const at::Tensor& basis) {
   const WithoutAutocast full_precision;
   const at::NoTF32Guard of_matrix_products;
-  const auto parts = by_vector(u, u.dim() > 2 && basis.dim() == u.dim());
-  const auto rows = basis.flatten(1).to(u.scalar_type());
-  const auto gram = at::matmul(rows, rows.t());
-  const auto along = at::linalg_solve(gram, at::matmul(parts, rows.t()), /*left=*/false);  // zero, up to rounding
+  const bool of_samples = basis.dim() == u.dim() + 1;
+  const auto parts = by_vector(u, of_samples || (u.dim() > 2 && basis.dim() == u.dim()));
+  const auto rows = rows_of(basis, of_samples).to(u.scalar_type());
+  const auto zeros = rows.detach().eq(0).all(-1).to(rows.scalar_type());
+  const auto gram = at::matmul(rows, rows.mT()) + zeros.diag_embed();
+  const auto along = at::linalg_solve(gram, at::matmul(parts, rows.mT()), /*left=*/false);  // zero, up to rounding
   return u - at::matmul(along, rows).reshape_as(u);
 }
 
@@ -81,12 +100,13 @@ at::Tensor SingularOperator::orthonormal(const Basis& basis, const at::Tensor& v
     const auto n = by_channel(v).sym_size(-1);
     return at::full_symint({1, n}, 1.0 / std::sqrt(static_cast<double>(n.expect_int())), v.options());
   }
-  if (!basis.orthonormal.defined()) basis.orthonormal = orthonormalised(basis.given.flatten(1).to(at::kDouble), title_);
+  if (!basis.orthonormal.defined())
+    basis.orthonormal = orthonormalised(rows_of(basis.given, basis.is_of_samples(v)).to(at::kDouble), title_);
   return basis.orthonormal.to(v.scalar_type());
 }
 
 at::Tensor SingularOperator::without(const Basis& basis, const at::Tensor& v) const {
-  const auto parts = by_vector(v, basis.spans_channels(v));
+  const auto parts = by_vector(v, basis.spans_channels(v) || basis.is_of_samples(v));
   if (basis.is_constant()) return (parts - mean_in_order(parts, {-1})).reshape_as(v);
   const auto q = orthonormal(basis, v.detach());
   return without_parts(parts, q, q).reshape_as(v);
@@ -108,7 +128,8 @@ at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const a
   const int64_t batch = b.size(0), n = b.numel() / std::max<int64_t>(batch, 1), channels = n / q_right.size(-1);
   check_dense_fits(b, n, batch);
   const auto a = matrix_by_columns(product, b);
-  const auto q = at::kron(at::eye(channels, b.options()), at::matmul(q_left.mT(), q_right));
+  auto q = at::matmul(q_left.mT(), q_right);
+  if (channels > 1) q = at::kron(at::eye(channels, b.options()), q);
   const auto scale = a.detach().abs().amax({-2, -1}, /*keepdim=*/true);
   return solve_dense(a + scale * q, b.flatten(1).unsqueeze(-1)).reshape_as(b);
 }
@@ -120,7 +141,8 @@ std::optional<at::Tensor> SingularOperator::solve_on_axes(const at::Tensor& b, b
   auto a = stencil_of(*a_);
   if (!a) return std::nullopt;
   a->transposed = transposed;
-  const NamedNullSpace named{right_.count().expect_int(), right_.is_constant() && left_.is_constant()};
+  const NamedNullSpace named{right_.count(right_.is_of_samples(b)).expect_int(),
+                             right_.is_constant() && left_.is_constant()};
   const auto u = solve_stencil_on_axes(*a, transposed ? project_solution(b) : project(b), named);
   return u ? std::optional(transposed ? project(*u) : project_solution(*u)) : std::nullopt;
 }
@@ -142,7 +164,14 @@ std::vector<at::Tensor> SingularOperator::product_rule(const at::Tensor& lambda,
 
 std::unique_ptr<Operator> SingularOperator::select(const at::Tensor& index) const {
   auto chosen = a_->select(index);
-  return chosen ? std::make_unique<SingularOperator>(std::move(chosen), spec_) : nullptr;
+  if (!chosen) return nullptr;
+  auto spec = spec_;
+  for (size_t k = spec.tensors.size() - 2; k < spec.tensors.size(); ++k) {
+    auto& basis = spec.tensors[k];
+    const bool of_samples = basis.dim() == static_cast<int64_t>(vector_shape().size()) + 2;
+    if (of_samples && basis.size(0) > 1) basis = basis.index_select(0, index.to(basis.device()));
+  }
+  return std::make_unique<SingularOperator>(std::move(chosen), spec);
 }
 
 std::optional<kernels::FactorKey> SingularOperator::key(bool transposed) const {
@@ -166,32 +195,51 @@ std::optional<gpu::OperatorView> SingularOperator::gpu_view(const at::Tensor& b,
   return view;
 }
 
+namespace {
+
+/// An orthonormal basis (k, n) or (batch or 1, k, n) as numbers of the host.
+class BasisOfSamples {
+ public:
+  explicit BasisOfSamples(const at::Tensor& q)
+      : q_((q.dim() == 2 ? q.unsqueeze(0) : q).to(at::kCPU, at::kDouble).contiguous()) {}
+  /// The vectors of a sample, without those of zeros.
+  std::vector<std::vector<double>> of(int64_t s) const {
+    const int64_t n = q_.size(2);
+    const double* const first = q_.const_data_ptr<double>() + (q_.size(0) == 1 ? 0 : s) * q_.size(1) * n;
+    std::vector<std::vector<double>> rows;
+    for (const double* row = first; row != first + q_.size(1) * n; row += n)
+      if (std::any_of(row, row + n, [](double x) { return x != 0; })) rows.emplace_back(row, row + n);
+    return rows;
+  }
+
+ private:
+  at::Tensor q_;
+};
+
+}  // namespace
+
 std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tensor& b, bool transposed) const {
   const auto regular = a_->kernels(b, transposed);
   if (!regular) return nullptr;
-  const auto rows_of = [&](const Basis& basis) {
-    const auto q = orthonormal(basis, b.detach()).to(at::kCPU, at::kDouble).contiguous();
-    std::vector<std::vector<double>> rows;
-    for (int64_t k = 0; k < q.size(0); ++k)
-      rows.emplace_back(q[k].const_data_ptr<double>(), q[k].const_data_ptr<double>() + q.size(1));
-    return rows;
+  const auto vectors_of = [&](const Basis& basis) {
+    return std::make_shared<const BasisOfSamples>(orthonormal(basis, b.detach()));
   };
-  const auto right = std::make_shared<const std::vector<std::vector<double>>>(rows_of(transposed ? left_ : right_));
-  const auto left = std::make_shared<const std::vector<std::vector<double>>>(rows_of(transposed ? right_ : left_));
-  const bool spans_channels = right_.spans_channels(b);
+  const auto right = vectors_of(transposed ? left_ : right_), left = vectors_of(transposed ? right_ : left_);
+  const bool spans_channels = right_.spans_channels(b), of_samples = right_.is_of_samples(b);
   return std::visit(
       [&]<class T>(const kernels::KernelBatch<T>& batch) {
         const auto make = [regular, &batch, right, left, spans_channels](int64_t s) {
-          auto a = batch.make(s);
-          if (!a) return a;
+          auto a = batch.make(batch.is_shared ? 0 : s);
+          const auto of_right = right->of(s);
+          if (!a || of_right.empty()) return a;
           const auto& layout = a->layout();
           const int64_t fields = layout.planes, span = spans_channels ? fields : 1;
-          a->set_null_spaces({layout, 0, fields, *right, span}, {layout, 0, fields, *left, span});
+          a->set_null_spaces({layout, 0, fields, of_right, span}, {layout, 0, fields, left->of(s), span});
           a->set_needs_projection();
           return a;
         };
         return std::make_shared<const kernels::Kernels>(
-            kernels::Kernels{kernels::KernelBatch<T>{batch.is_shared, make}});
+            kernels::Kernels{kernels::KernelBatch<T>{batch.is_shared && !of_samples, make}});
       },
       regular->of_dtype);
 }

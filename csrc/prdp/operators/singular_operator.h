@@ -6,9 +6,10 @@
 namespace prdp {
 
 /// `a`, a stencil, a matrix or a function, with its null spaces named: vectors that it maps to zero, (k, *shape) for
-/// each channel of a vector (batch, channel, *shape) or (k, channels, *shape) for all channels together, and as many
-/// that Aᵀ maps to zero. Undefined: the constant of each channel; `left` is `right` if it is left out, as of a
-/// symmetric A.
+/// each channel of a vector (batch, channel, *shape), (k, channels, *shape) for all channels together, or the latter
+/// for each sample, (batch, k, channels, *shape), of a matrix (batch, k, n); there a sample that has fewer has zeros.
+/// And as many that Aᵀ maps to zero. Undefined: the constant of each channel; `left` is `right` if it is left out, as
+/// of a symmetric A.
 OperatorSpec with_null_space(OperatorSpec a, const at::Tensor& right = {}, std::optional<at::Tensor> left = {});
 
 /// u, of least norm, with the part of its derivative that comes of the null space: where the basis N depends on
@@ -24,9 +25,8 @@ at::Tensor by_vector(const at::Tensor& v, bool spans_channels);
 /// "singular_" and that of A; its tensors are those of A and the two bases.
 class SingularOperator final : public Operator {
  public:
-  /// `a` is the operator of `spec` without its null spaces. These, the last two tensors, are the same for every sample:
-  /// (k, *shape) for each channel of a vector (batch, channel, *shape), (k, channels, *shape) for all channels
-  /// together, or empty for the constant of each channel. Raises ValueError if they do not fit each other.
+  /// `a` is the operator of `spec` without its null spaces. These are the last two tensors, as with_null_space() has
+  /// them; an empty one is the constant of each channel. Raises ValueError if they do not fit each other.
   SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec);
 
   void check_vector(const at::Tensor& b) const override;
@@ -63,16 +63,20 @@ class SingularOperator final : public Operator {
 
  private:
   struct Basis {
-    at::Tensor given;  // (k, *shape), (k, channels, *shape), or empty for the constant of each channel
-    mutable at::Tensor orthonormal;  // (k, n) in double, once it has been asked for
+    at::Tensor given;
+    mutable at::Tensor orthonormal;  // in double, once it has been asked for
 
     bool is_constant() const { return given.sym_numel() == 0; }
+    /// Whether each sample of v has vectors of its own.
+    bool is_of_samples(const at::Tensor& v) const { return !is_constant() && given.dim() == v.dim() + 1; }
     /// Whether its vectors are of all channels that v has.
-    bool spans_channels(const at::Tensor& v) const { return !is_constant() && v.dim() > 2 && given.dim() == v.dim(); }
-    c10::SymInt count() const { return is_constant() ? c10::SymInt(1) : given.sym_size(0); }
+    bool spans_channels(const at::Tensor& v) const { return !is_constant() && v.dim() > 2 && given.dim() >= v.dim(); }
+    /// How many vectors there are: `axis` is 1 of those of samples, else 0.
+    c10::SymInt count(int64_t axis) const { return is_constant() ? c10::SymInt(1) : given.sym_size(axis); }
   };
 
-  /// An orthonormal basis (k, n) in the dtype of v, with n the unknowns of a channel, or of all.
+  void check_counts(const c10::SymInt& right, const c10::SymInt& left) const;
+  /// An orthonormal basis (k, n), or (batch, k, n), in the dtype of v, with n the unknowns of a channel, or of all.
   at::Tensor orthonormal(const Basis& basis, const at::Tensor& v) const;
   at::Tensor without(const Basis& basis, const at::Tensor& v) const;
   /// `size`: how large an entry of a product can be, of each sample or of all.

@@ -46,11 +46,12 @@ inline at::Tensor sample_totals(const at::Tensor& t) {
 /// v·w of each sample, (batch, 1, …).
 inline at::Tensor dot_in_order(const at::Tensor& v, const at::Tensor& w) { return sample_totals(v * w); }
 
-/// v, whose last axis runs over the unknowns, without Σ_k (v·dual_k) part_k. A matrix product would sum one row in
-/// another order than many.
+/// v (batch, fields, n) without Σ_k (v·dual_k) part_k. `dual`, `parts`: (k, n), or (batch or 1, k, n). A matrix product
+/// would sum one row in another order than many.
 inline at::Tensor without_parts(at::Tensor v, const at::Tensor& dual, const at::Tensor& parts) {
   const auto whole = v;
-  for (int64_t k = 0; k < parts.size(0); ++k) v = v - sum_in_order(whole * dual[k], {-1}) * parts[k];
+  const auto vector = [](const at::Tensor& of, int64_t k) { return of.narrow(-2, k, 1); };
+  for (int64_t k = 0; k < parts.size(-2); ++k) v = v - sum_in_order(whole * vector(dual, k), {-1}) * vector(parts, k);
   return v;
 }
 

@@ -61,6 +61,7 @@ void launch(const HierarchyKernel& kernel, const at::Tensor& hierarchy) {
   arguments.work = memory.own<double>();
   arguments.samples = hierarchy.size(0);
   arguments.nullity = kernel.nullity;
+  arguments.nullities = kernel.nullities.defined() ? kernel.nullities.const_data_ptr<int64_t>() : nullptr;
   memory.put_into(arguments);
   kernel.kernel->launch(teams, &arguments);
 }
@@ -85,9 +86,11 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
   const int64_t weights = 4 * points, inverse = kMostOfCoarsest * kMostOfCoarsest;
   const int64_t numbers = offsets * (points + most_coarse_points(b.sizes().slice(2))) + weights + inverse;
   const auto& basis = a.null_space;
-  const int64_t nullity = !a.needs_projection || !basis.defined() ? 0 : basis.numel() == 0 ? 1 : basis.size(0);
+  const int64_t nullity = !a.needs_projection || !basis.defined() ? 0 : basis.numel() == 0 ? 1 : basis.size(-2);
+  const bool of_samples = nullity > 0 && basis.dim() == 3 && basis.size(0) > 1;
+  const auto nullities = of_samples ? basis.ne(0).any(-1).sum(-1) : at::Tensor();
   auto kernel = runtime.kernel(b.device(), {text.str(), threads, 0, blocks});
-  return {std::move(kernel), std::move(a), blocks, numbers, nullity};
+  return {std::move(kernel), std::move(a), blocks, numbers, nullity, nullities};
 }
 
 at::Tensor make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b) {

@@ -10,6 +10,7 @@ struct HierarchyKernel {
   std::shared_ptr<const Kernel> kernel;
   OperatorView a;             // what the grids are made of
   int64_t blocks_of_team, numbers_of_sample, nullity;
+  at::Tensor nullities;  // of each sample; undefined: that of all
 };
 
 /// Of this operator, for vectors like b, (batch, channel, *shape). Raises Unavailable.

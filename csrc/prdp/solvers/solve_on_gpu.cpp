@@ -26,7 +26,7 @@ std::string not_made(const Solver& solver) {
 
 /// Entries of a vector that a null space belongs to: those of a channel, or of all that it spans.
 int64_t length_of(const at::Tensor& basis, const at::Tensor& b) {
-  if (basis.defined() && basis.numel() > 0) return basis.size(1);
+  if (basis.defined() && basis.numel() > 0) return basis.size(-1);
   return b.numel() / (b.size(0) * (b.dim() < 3 ? 1 : b.size(1)));
 }
 
@@ -36,7 +36,8 @@ NullSpaceArguments<T> arguments_of(const at::Tensor& basis, const at::Tensor& b,
   const bool constant = basis.numel() == 0, one = field >= 0;
   const int64_t length = length_of(basis, b), unknowns = b.numel() / b.size(0);
   return {.basis = constant ? nullptr : basis.const_data_ptr<T>(),
-          .count = constant ? 1 : basis.size(0),
+          .sample = basis.dim() == 3 && basis.size(0) > 1 ? basis.stride(0) : 0,
+          .count = constant ? 1 : basis.size(-2),
           .first = one ? field : 0,
           .fields = one ? 1 : unknowns / length,
           .length = length};

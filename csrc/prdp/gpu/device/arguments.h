@@ -10,7 +10,8 @@ namespace prdp::gpu {
 /// consecutive parts of a sample, starting with part `first`.
 template <class T>
 struct NullSpaceArguments {
-  const T* basis;  // (count, length); null: the constant vector
+  const T* basis;  // (count, length), or one of each sample; null: the constant vector
+  int64_t sample;  // entries between two samples; 0: they share it
   int64_t count;   // 0: there is none
   int64_t first, fields, length;
 };
@@ -66,6 +67,7 @@ struct HierarchyArguments {
   double* parts;
   int64_t samples;
   int64_t nullity;            // how many vectors A is said to map to zero
+  const int64_t* nullities;   // of each sample; null: that of all
 };
 
 /// A hierarchy as a solve uses it.

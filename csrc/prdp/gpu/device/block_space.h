@@ -48,6 +48,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
         cycle_{of.hierarchy, sample, in_block, beyond + Vectors::kCyclesAt},
         null_space_(of.null_space),
         left_null_space_(of.left_null_space),
+        sample_(sample),
         needs_projection_(of.needs_projection != 0),
         constant_(T(1) / std::sqrt(static_cast<T>(of.left_null_space.length))) {}
 
@@ -265,7 +266,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   T entry_of(const NullSpaceArguments<T>& space, int field, int k, int i) const {
     const int length = static_cast<int>(space.length), at = i - (static_cast<int>(space.first) + field) * length;
     if (at < 0 || at >= length) return T(0);
-    return space.basis ? space.basis[k * length + at] : constant_;
+    return space.basis ? space.basis[sample_ * space.sample + k * length + at] : constant_;
   }
   /// Parts no larger than `negligible` stay.
   PRDP_NOINLINE T project(const NullSpaceArguments<T>& space, Vector v, T negligible = 0) {
@@ -314,6 +315,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   typename S::Cycles::template Of<S> cycle_;
   SampleState* state_ = nullptr;
   const NullSpaceArguments<T>&null_space_, &left_null_space_;
+  int64_t sample_;
   bool needs_projection_;
   T constant_;  // the entry of a vector of equal numbers whose norm is one
   T factor_ = 1, b2_ = 0;

@@ -123,6 +123,7 @@ struct FlowChange {
 template <class T>
 struct FlowDiffusionEntries {
   const T* patterns[3];
+  int64_t sample;  // entries of a pattern between two samples; 0: they share it
   FlowNumber<T> nu;
   double dt;
   int samples, entries, cells;
@@ -130,7 +131,7 @@ struct FlowDiffusionEntries {
 
   void operator()(int i) const {
     const int of_sample = entries * cells, at = i % of_sample, s = i / of_sample % samples;
-    const T scaled = patterns[i / of_sample / samples][at] * (nu.value(s) * static_cast<T>(dt));
+    const T scaled = patterns[i / of_sample / samples][s * sample + at] * (nu.value(s) * static_cast<T>(dt));
     out[i] = at < cells ? scaled + T(1) : scaled;
   }
 };

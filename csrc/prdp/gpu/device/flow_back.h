@@ -130,6 +130,7 @@ struct FlowViscosityBars {
   // Of I - ν dt Δ: its solutions, the cotangents of what they solve for, and -Δ of each channel. Absent: no system.
   FlowField<const T> diffused, lambda;
   const T* patterns[3];
+  int64_t sample;  // entries of a pattern between two samples; 0: they share it
   // Of the share of the pressure that is taken off beyond a largest ν. Absent: the whole one is.
   FlowField<const T> change, balanced, potential, potential_bar;
   double largest_nu;
@@ -156,7 +157,7 @@ struct FlowViscosityBars {
  private:
   /// -Δ of what was diffused. The entries: of the point itself, and of its neighbours low and high along each axis.
   double of_pattern(const FlowGrid& grid, int s, int c, const FlowPlace& p) const {
-    const T* entry = patterns[c] + (p.at[0] * grid.n[1] + p.at[1]) * grid.n[2] + p.at[2];
+    const T* entry = patterns[c] + s * sample + (p.at[0] * grid.n[1] + p.at[1]) * grid.n[2] + p.at[2];
     double sum = static_cast<double>(*entry) * static_cast<double>(diffused.at(s, c, p));
     for (int a = grid.first_axis(); a < 3; ++a)
       for (int cells = -1; cells <= 1; cells += 2) {

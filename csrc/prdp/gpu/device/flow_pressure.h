@@ -8,14 +8,15 @@ namespace prdp::gpu {
 /// The closed parts of the fluid, where a pressure has no level.
 template <class T>
 struct FlowClosedParts {
-  const T* of;  // (count, cells), 1 in the cells of a part; null: one of all cells
+  const T* of;  // (count, cells), 1 in the cells of a part, 0 in all where there are fewer; null: one of all cells
+  int64_t sample;  // entries between two samples; 0: they share the parts
   int count;
 
-  /// Takes off the mean of each part. The threads of a team own the cells of v that they write.
+  /// Takes off the mean of each part of sample s. The threads of a team own the cells of v that they write.
   template <class Team>
-  void without_means(Team& team, int cells, T* v) const {
+  void without_means(int s, Team& team, int cells, T* v) const {
     for (int k = 0; k < count; ++k) {
-      const T* const part = of ? of + static_cast<int64_t>(k) * cells : nullptr;
+      const T* const part = of ? of + s * sample + static_cast<int64_t>(k) * cells : nullptr;
       double sums[2] = {0, 0};
       team.each(
           cells, [&](int i) { return static_cast<double>(part ? part[i] * v[i] : v[i]); },
@@ -24,7 +25,7 @@ struct FlowClosedParts {
             sums[1] += part ? static_cast<double>(part[i]) : 1.0;
           });
       team.sum(sums);
-      const T mean = static_cast<T>(sums[0] / sums[1]);
+      const T mean = static_cast<T>(sums[0] / (sums[1] > 0 ? sums[1] : 1.0));
       team.each(
           cells, [&](int i) { return part ? v[i] - mean * part[i] : v[i] - mean; },
           [&](int i, T value) { v[i] = value; });
@@ -70,7 +71,7 @@ struct FlowDivergence {
   FlowShare<T> share;
   double factor;
   bool for_a_solve;  // else the divergence as it is
-  T* b;              // (batch, cells)
+  T* b;  // (batch, cells)
 
   template <class Team>
   void operator()(int s, Team& team) const {
@@ -80,8 +81,8 @@ struct FlowDivergence {
     const auto store = [&](int i, T value) { mine[i] = value; };
     team.each(n, [&](int i) { return at(s, grid.place(i)); }, store);
     if (!for_a_solve) return;
-    parts.without_means(team, n, mine);
-    if (potential_bar) parts.without_means(team, n, mine);  // as project_vjp()
+    parts.without_means(s, team, n, mine);
+    if (potential_bar) parts.without_means(s, team, n, mine);  // as project_vjp()
     const T largest = largest_of(team, n, [&](int i) { return std::abs(mine[i]); });
     if (largest < std::numeric_limits<T>::min()) team.each(n, [](int) { return T(0); }, store);
   }
@@ -112,7 +113,7 @@ struct FlowCorrection {
   double factor;
   bool on_all_faces;
   const T *found, *before;  // (batch, cells); `before`: a potential that the share of φ is added to; or null
-  T *phi, *potential;       // (batch, cells); the second may be null
+  T *phi, *potential;  // (batch, cells); the second may be null
   FlowField<T> out, on_free_faces;  // the second may be absent
 
   template <class Team>
@@ -123,7 +124,7 @@ struct FlowCorrection {
     team.each(
         n, [&](int i) { return cells ? found[begin + i] * cells.at(s, 0, grid.place(i)) : found[begin + i]; },
         [&](int i, T value) { phi[begin + i] = value; });
-    parts.without_means(team, n, phi + begin);
+    parts.without_means(s, team, n, phi + begin);
     if (potential)
       team.each(
           n, [&](int i) { return share.value(s) * phi[begin + i] + (before ? before[begin + i] : T(0)); },

@@ -33,7 +33,7 @@ class HierarchyMaker {
       : team_(team),
         grids_(of.grids[sample]),
         numbers_(of.numbers + sample * of.numbers_of_sample),
-        nullity_(static_cast<int>(of.nullity)),
+        nullity_(static_cast<int>(of.nullities ? of.nullities[sample] : of.nullity)),
         work_(work) {}
 
   void make(A a) {

@@ -50,10 +50,9 @@ Parts find_parts(const FlowBox& box, const at::Tensor& fluid) {
   return parts;
 }
 
-/// The parts without an open end, as FlowFields has them.
-at::Tensor find_closed_parts(const FlowBox& box, const at::Tensor& fluid) {
+/// The parts without an open end, (parts, *shape). `whose` obstacle it is, for errors.
+at::Tensor find_closed_parts(const FlowBox& box, const at::Tensor& fluid, const std::string& whose) {
   const int64_t open = box.open_axis();
-  if (open < 0 && !box.obstacle().defined()) return at::empty({0}, at::kDouble);
   const auto parts = find_parts(box, fluid);
   std::vector<bool> inlet(parts.count), outlet(parts.count);
   const auto cells = static_cast<int64_t>(parts.of_cell.size());
@@ -63,16 +62,17 @@ at::Tensor find_closed_parts(const FlowBox& box, const at::Tensor& fluid) {
     if (position(box, cell, open) == box.shape()[open] - 1) outlet[parts.of_cell[cell]] = true;
   }
   const auto numbers = at::tensor(parts.of_cell, at::kLong).reshape(box.shape());
-  std::vector<at::Tensor> closed;
+  std::vector<at::Tensor> closed{at::empty(box.shape(), at::kDouble).unsqueeze(0).narrow(0, 0, 0)};
   for (int64_t p = 0; p < parts.count; ++p) {
-    TORCH_CHECK_VALUE(!inlet[p] || outlet[p],
-                      "Flow: the obstacle keeps fluid that comes in at the open end from going out at the other; make "
+    TORCH_CHECK_VALUE(!inlet[p] || outlet[p], "Flow: the obstacle", whose,
+                      " keeps fluid that comes in at the open end from going out at the other; make "
                       "the cells before it solid, or open a way");
     const auto cells_of_part = numbers.eq(p);
     // The pressure of a cell without a free face is known.
-    if (!outlet[p] && cells_of_part.sum().item<int64_t>() > 1) closed.push_back(cells_of_part.to(at::kDouble));
+    if (!outlet[p] && cells_of_part.sum().item<int64_t>() > 1)
+      closed.push_back(cells_of_part.to(at::kDouble).unsqueeze(0));
   }
-  return closed.empty() ? at::Tensor() : at::stack(closed);
+  return at::cat(closed);
 }
 
 /// The coefficient of each neighbour, low and high along each axis, behind that of the point itself.
@@ -171,32 +171,69 @@ at::Tensor signs_beyond_high_wall(const FlowBox& box, int64_t axis) {
 
 bool all_ones(const at::Tensor& mask) { return mask.eq(1).all().item<bool>(); }
 
-}  // namespace
-
-FlowFields make_flow_fields(const FlowBox& box) {
-  const at::NoGradGuard no_grad;
+/// Of the box with these cells of fluid, (*shape): the masks are all there.
+FlowFields fields_with(const FlowBox& box, const at::Tensor& fluid, const std::string& whose) {
   const int64_t open = box.open_axis();
-  const bool has_obstacle = box.obstacle().defined();
-  const auto fluid = has_obstacle ? box.obstacle().logical_not() : at::ones(box.shape(), at::kBool);
-  TORCH_CHECK_VALUE(fluid.any().item<bool>(), "Flow: the obstacle fills the grid; at least one cell must be fluid");
+  TORCH_CHECK_VALUE(fluid.any().item<bool>(), "Flow: the obstacle", whose,
+                    " fills the grid; at least one cell must be fluid");
   const auto faces = make_face_masks(box, fluid.to(at::kDouble));
   FlowFields fields;
-  for (int64_t axis = 0; axis < box.dim(); ++axis) {
-    fields.low_sign.push_back(sign_beyond_wall(box, axis));
-    fields.high_sign.push_back(signs_beyond_high_wall(box, axis));
-  }
   for (int64_t c = 0; c < box.dim(); ++c)
     fields.diffusion.push_back(diffusion_coefficients(box, box.dim() - 1 - c, faces.free[c], faces.inside[c]));
   auto given = fluid.logical_not();
   if (open >= 0) given.narrow(open, box.shape()[open] - 1, 1).fill_(true);
   const auto pressure = pressure_coefficients(box, faces.free, given);
   fields.pressure = pressure.coefficients;
-  fields.closed_parts = find_closed_parts(box, fluid);
-
   fields.cells = pressure.known.logical_not().to(at::kDouble).unsqueeze(0).unsqueeze(0);
   fields.free = faces.free.unsqueeze(0);
-  if (open >= 0) fields.inlet = faces.inlet.unsqueeze(0);
-  if (has_obstacle) fields.friction = friction_coefficients(box, faces).unsqueeze(0);
+  fields.inlet = faces.inlet.unsqueeze(0);
+  fields.friction = friction_coefficients(box, faces).unsqueeze(0);
+  fields.closed_parts = find_closed_parts(box, fluid, whose).unsqueeze(0);
+  return fields;
+}
+
+/// The fields of several boxes as those of samples.
+FlowFields of_samples(const std::vector<FlowFields>& boxes) {
+  if (boxes.size() == 1) return boxes[0];
+  const auto stacked = [&](const auto& part) {
+    std::vector<at::Tensor> all;
+    for (const auto& box : boxes) all.push_back(part(box));
+    return at::cat(all);
+  };
+  FlowFields fields;
+  for (auto part :
+       {&FlowFields::cells, &FlowFields::free, &FlowFields::inlet, &FlowFields::friction, &FlowFields::pressure})
+    fields.*part = stacked([&](const FlowFields& box) { return box.*part; });
+  for (size_t c = 0; c < boxes[0].diffusion.size(); ++c)
+    fields.diffusion.push_back(stacked([&](const FlowFields& box) { return box.diffusion[c]; }));
+  int64_t most = 0;
+  for (const auto& box : boxes) most = std::max(most, box.closed_parts.size(1));
+  fields.closed_parts = stacked([&](const FlowFields& box) {
+    auto sizes = box.closed_parts.sizes().vec();
+    sizes[1] = most - sizes[1];
+    return at::cat({box.closed_parts, at::zeros(sizes, at::kDouble)}, 1);
+  });
+  return fields;
+}
+
+}  // namespace
+
+FlowFields make_flow_fields(const FlowBox& box) {
+  const at::NoGradGuard no_grad;
+  const bool has_obstacle = box.obstacle().defined();
+  const auto fluid = has_obstacle ? box.obstacle().logical_not() : at::ones(box.shape(), at::kBool).unsqueeze(0);
+  std::vector<FlowFields> boxes;
+  for (int64_t s = 0; s < fluid.size(0); ++s)
+    boxes.push_back(fields_with(box, fluid[s], fluid.size(0) > 1 ? " of sample " + std::to_string(s) : ""));
+  auto fields = of_samples(boxes);
+  for (int64_t axis = 0; axis < box.dim(); ++axis) {
+    fields.low_sign.push_back(sign_beyond_wall(box, axis));
+    fields.high_sign.push_back(signs_beyond_high_wall(box, axis));
+  }
+  if (box.open_axis() < 0) fields.inlet = at::Tensor();
+  if (!has_obstacle) fields.friction = at::Tensor();
+  if (!has_obstacle && box.open_axis() < 0) fields.closed_parts = at::empty({0}, at::kDouble);
+  else if (fields.closed_parts.numel() == 0) fields.closed_parts = at::Tensor();
   if (all_ones(fields.free)) fields.diffusion.resize(1);  // periodic, no obstacle: all components are alike
   for (auto* mask : {&fields.cells, &fields.free})
     if (all_ones(*mask)) *mask = at::Tensor();

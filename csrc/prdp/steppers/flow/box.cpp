@@ -50,9 +50,14 @@ FlowBox::FlowBox(std::vector<int64_t> shape, const std::vector<FlowBoundary>& bo
   if (obstacle_.defined()) {
     TORCH_CHECK_TYPE(obstacle_.scalar_type() == at::kBool,
                      "Flow: obstacle must be a bool tensor, true in solid cells, got ", obstacle_.scalar_type());
-    TORCH_CHECK_VALUE(obstacle_.sizes() == at::IntArrayRef(shape_), "Flow: obstacle must have the shape of the grid, ",
-                      at::IntArrayRef(shape_), ", got ", obstacle_.sizes());
+    const bool is_of_all = obstacle_.sizes() == at::IntArrayRef(shape_);
+    TORCH_CHECK_VALUE(
+        is_of_all || (obstacle_.dim() == dim() + 1 && obstacle_.sizes().slice(1) == at::IntArrayRef(shape_)),
+        "Flow: obstacle must have the shape of the grid, ", at::IntArrayRef(shape_), ", or (batch or 1) of them, got ",
+        obstacle_.sizes());
     obstacle_ = obstacle_.detach().to(at::kCPU, /*non_blocking=*/false, /*copy=*/true).contiguous();
+    if (is_of_all) obstacle_ = obstacle_.unsqueeze(0);
+    samples_ = obstacle_.size(0);
     if (!obstacle_.any().item<bool>()) obstacle_ = at::Tensor();
   }
   fields_ = make_flow_fields(*this);
@@ -66,7 +71,8 @@ int64_t FlowBox::open_axis() const {
 bool FlowBox::is_held() const {
   const auto holds = [](FlowBoundary b) { return b == FlowBoundary::kWall || b == FlowBoundary::kOpen; };
   const auto is_closed = [](FlowBoundary b) { return b != FlowBoundary::kPeriodic; };
-  return obstacle_.defined() || std::any_of(boundary_.begin(), boundary_.end(), holds) ||
+  const bool all_have_obstacles = obstacle_.defined() && obstacle_.flatten(1).any(1).all().item<bool>();
+  return all_have_obstacles || std::any_of(boundary_.begin(), boundary_.end(), holds) ||
          std::all_of(boundary_.begin(), boundary_.end(), is_closed);
 }
 
@@ -90,6 +96,8 @@ void FlowBox::check_velocity(const at::Tensor& u) const {
     for (const int64_t n : shape_) expected << ", " << n;
     TORCH_CHECK_VALUE(false, "Flow: expected u of shape (batch, ", dim(), expected.str(), "), got ", u.sizes());
   }
+  TORCH_CHECK_VALUE(samples_ == 1 || samples_ == u.size(0), "Flow: obstacle holds ", samples_, " samples, u holds ",
+                    u.size(0));
   TORCH_CHECK_TYPE(u.scalar_type() == at::kFloat || u.scalar_type() == at::kDouble,
                    "Flow: u must be float32 or float64, got ", u.scalar_type());
 }

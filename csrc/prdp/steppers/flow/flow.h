@@ -20,7 +20,7 @@ struct FlowSide {
 struct FlowSettings {
   std::vector<FlowBoundary> boundary{FlowBoundary::kPeriodic};  // one for all axes, or one per axis
   Length length = 1.0;
-  at::Tensor obstacle{};  // bool (*shape), true in solid cells
+  at::Tensor obstacle{};  // bool (*shape), or (batch or 1, *shape) for one of each sample; true in solid cells
   at::Tensor force{};     // (d,) or (batch or 1, d, *shape); may get a gradient
   at::Tensor inflow{};  // for an open axis: (d,) or (batch or 1, d, *shape with one cell along it); may get a gradient
   FlowAdvection advection = FlowAdvection::kCentral;

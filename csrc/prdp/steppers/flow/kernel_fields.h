@@ -54,6 +54,9 @@ gpu::FlowField<T> field_of(const FlowParts& parts) {
   return field;
 }
 
+/// Entries between two samples of a contiguous tensor; 0: they share it.
+inline int64_t step_of_samples(const at::Tensor& t) { return t.size(0) > 1 ? t.stride(0) : 0; }
+
 /// A tensor without axes, which may be on the host: nobody waits for it; or (batch or 1, 1, …). Undefined: 0.
 template <class T>
 gpu::FlowNumber<T> number_of(const at::Tensor& t) {

@@ -26,9 +26,9 @@ gpu::FlowVelocity<T> velocity_of(const FlowBox& box, const UncorrectedVelocity& 
 template <class T>
 gpu::FlowClosedParts<T> parts_of(const FlowBox& box, const at::Tensor& like) {
   const auto& parts = box.fields(like.options()).closed_parts;
-  if (!parts.defined()) return {nullptr, 0};
-  if (parts.numel() == 0) return {nullptr, 1};
-  return {data_of<const T>(parts), static_cast<int>(parts.size(0))};
+  if (!parts.defined()) return {nullptr, 0, 0};
+  if (parts.numel() == 0) return {nullptr, 0, 1};
+  return {data_of<const T>(parts), step_of_samples(parts), static_cast<int>(parts.size(1))};
 }
 
 template <class T>
@@ -131,11 +131,12 @@ std::optional<Corrected> correct(const FlowBox& box, const UncorrectedVelocity& 
 at::Tensor diffusion_coefficients(const FlowEquation& e, const at::Tensor& like) {
   const auto& patterns = e.box->fields(like.options()).diffusion;
   auto sizes = patterns[0].sizes().vec();
-  sizes[0] = e.nu.numel();
+  sizes[0] = std::max(sizes[0], e.nu.numel());
   sizes.insert(sizes.begin(), static_cast<int64_t>(patterns.size()));
   const auto out = at::empty(sizes, like.options());
   const bool launched = each_point({"FlowDiffusionEntries", kFlow}, out, out.numel(), [&]<class T>(T) {
     gpu::FlowDiffusionEntries<T> of{.patterns = {},
+                                    .sample = step_of_samples(patterns[0]),
                                     .nu = number_of<T>(e.nu),
                                     .dt = e.dt,
                                     .samples = static_cast<int>(sizes[1]),

@@ -69,6 +69,7 @@ gpu::FlowViscosityBars<T> viscosity_bars_of(const FlowBox& box, const ImplicitPa
   gpu::FlowViscosityBars<T> of{.diffused = field_of<const T>(part.diffused),
                                .lambda = field_of<const T>(part.lambda),
                                .patterns = {},
+                               .sample = 0,
                                .change = field_of<const T>(part.change),
                                .balanced = field_of<const T>(part.potential.defined() ? part.balanced : at::Tensor()),
                                .potential = field_of<const T>(part.potential),
@@ -76,6 +77,7 @@ gpu::FlowViscosityBars<T> viscosity_bars_of(const FlowBox& box, const ImplicitPa
                                .largest_nu = part.largest_nu};
   if (part.diffused.empty()) return of;
   const auto& patterns = box.fields(part.change.options()).diffusion;
+  of.sample = step_of_samples(patterns[0]);
   for (size_t c = 0; c < static_cast<size_t>(box.dim()); ++c)
     of.patterns[c] = data_of<const T>(patterns[std::min(c, patterns.size() - 1)]);
   return of;

@@ -21,7 +21,9 @@ namespace {
 OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u) {
   const auto& fields = box.fields(u.options());
   auto a = stencil_of(box, fields.pressure);
-  return fields.closed_parts.defined() ? with_null_space(std::move(a), fields.closed_parts) : a;
+  const auto& parts = fields.closed_parts;
+  if (!parts.defined()) return a;
+  return with_null_space(std::move(a), parts.size(0) > 1 ? parts.unsqueeze(2) : parts.squeeze(0));
 }
 
 /// All solves for the pressure share the coarse grids, and have right-hand sides without_means().
@@ -37,8 +39,9 @@ at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
   if (!parts.defined()) return t;
   const auto flat = t.flatten(2);
   if (parts.numel() == 0) return (flat - mean_in_order(flat, {-1})).view_as(t);
-  const auto of_parts = parts.flatten(1);
-  return without_parts(flat, of_parts / of_parts.sum(1, /*keepdim=*/true), of_parts).view_as(t);
+  const auto of_parts = parts.flatten(2);
+  const auto cells = of_parts.sum(2, /*keepdim=*/true).clamp_min(1);
+  return without_parts(flat, of_parts / cells, of_parts).view_as(t);
 }
 
 /// Divergences that the dtype has no normal numbers for are rounding, and nothing to do: they are zero to the solve,

@@ -1,0 +1,196 @@
+"""`Flow` with an obstacle for each sample, (batch, *shape). Each sample has the result that it has alone."""
+
+import contextlib
+
+import pytest
+import torch
+from fibers import Fibers
+from helpers import statuses
+from test_gpu_flow import BOX, F32, F64, PLANE, noise
+
+import prdp_torch as prdp
+
+WAYS = {"loops": contextlib.nullcontext, "kernels": Fibers}
+WIDE = (7, 8)
+
+
+def block(shape, *cells):
+    solid = torch.zeros(shape, dtype=torch.bool)
+    for cell in cells:
+        solid[cell] = True
+    return solid
+
+
+def ring(shape):
+    """A solid ring around a cell of fluid: a closed part of its own, whose pressure is known; and one around two."""
+    solid = block(shape, (slice(1, 4), slice(1, 5)))
+    solid[2, 2:4] = False
+    return solid
+
+
+CASES = {  # shape, an obstacle for each of three samples, settings
+    "periodic": (PLANE, [block(PLANE, (2, 2)), block(PLANE, (1, 3), (4, 0)), block(PLANE, (2, slice(1, 4)))], {}),
+    "cavity": (
+        WIDE,
+        [block(WIDE, (3, 3)), ring(WIDE), block(WIDE, (5, slice(2, 6)))],
+        {"boundary": "wall", "wall_velocity": {(0, "high"): 1.0}, "nu": 0.7},
+    ),
+    "channel": (
+        PLANE,
+        [block(PLANE, (2, slice(2, 4))), block(PLANE, (1, 1), (3, 4)), block(PLANE, (0, 0))],
+        {"boundary": ("wall", "open"), "inflow": noise(3, 2, 5, 1)},
+    ),
+    "pockets": (
+        WIDE,
+        [block(WIDE, (2, 2)), ring(WIDE), ring(WIDE).roll((2, 1), (0, 1))],
+        {"boundary": ("wall", "open"), "inflow": torch.tensor([0.5, 0.0])},
+    ),
+    "explicit": (
+        PLANE,
+        [block(PLANE, (2, 2)), block(PLANE, (1, 3)), block(PLANE, (slice(2, 4), 4))],
+        {"diffusion": "explicit", "advection": "upwind", "force": noise(3, 2, *PLANE)},
+    ),
+    "box": (BOX, [block(BOX, (1, 1, 1)), block(BOX, (1, 2, slice(1, 3))), block(BOX, (0, 0, 0))], {"boundary": "wall"}),
+    "viscosities": (
+        PLANE,
+        [block(PLANE, (2, 2)), block(PLANE, (1, 3)), block(PLANE, (3, slice(2, 4)))],
+        {"boundary": ("wall", "periodic"), "nu": torch.tensor([0.02, 0.3, 9.0], dtype=F64)},
+    ),
+}
+names = pytest.mark.parametrize("name", CASES)
+ALL = [0, 1, 2]
+
+
+def outcome(name, samples, dtype=F64, together=True, graph=False, **options):
+    """The states of two steps, the pressure of one, the projection, and the gradients of u and nu."""
+    shape, solids, settings = CASES[name]
+    settings = {"nu": 0.02, **settings}
+    for key, t in settings.items():
+        if isinstance(t, torch.Tensor):
+            settings[key] = (t[samples] if t.shape[0] == 3 and len(shape) == 2 else t).to(dtype)
+    nu = settings.pop("nu")
+    nu = (nu.clone() if isinstance(nu, torch.Tensor) else torch.tensor(nu, dtype=dtype)).requires_grad_()
+    u = (0.5 * noise(3, len(shape), *shape, seed=1, dtype=dtype))[samples].requires_grad_()
+    obstacle = torch.stack(solids)[samples] if together else solids[samples[0]]
+    rtol = 1e-13 if dtype == F64 else 1e-6
+    step = prdp.Flow(shape, nu, 0.01, obstacle=obstacle, solver=prdp.CG(200, rtol=rtol), **settings, **options)
+    found = step.rollout(u, 2), *step.step_and_pressure(u), step.project(u)
+    weights = [noise(3, *t.shape[1:], seed=2, dtype=dtype)[samples] for t in found]
+    u_bar, nu_bar = torch.autograd.grad(found, (u, nu), weights, create_graph=graph)
+    assert step.info.solved.all()
+    return [t.detach() for t in (*found, u_bar)], nu_bar.detach()
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("dtype", [F32, F64], ids=["float32", "float64"])
+@names
+def test_each_sample_is_as_alone(name, dtype, way):
+    with WAYS[way]():
+        together, nu_bar = outcome(name, ALL, dtype)
+        alone = [outcome(name, [i], dtype, together=False) for i in ALL]
+    for k, all_samples in enumerate(together):
+        assert torch.equal(all_samples, torch.cat([one[k] for one, _ in alone]))
+    of_each = torch.stack([bar for _, bar in alone])
+    if nu_bar.dim() == 1:
+        assert torch.equal(nu_bar, of_each[:, 0])
+    else:
+        torch.testing.assert_close(nu_bar, of_each.sum(0), rtol=1e-5 if dtype == F32 else 1e-12, atol=0)
+
+
+@names
+def test_all_ways_agree(name):
+    """Loops, kernels, the graph of second derivatives, and unrolled solves."""
+    expected = outcome(name, ALL)
+    others = [outcome(name, ALL, graph=True), outcome(name, ALL, backward="unrolled")]
+    with Fibers():
+        others.append(outcome(name, ALL))
+    for other in others:
+        for mine, its in zip((*other[0], other[1]), (*expected[0], expected[1]), strict=True):
+            torch.testing.assert_close(mine, its, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("solver", [prdp.CG(60, preconditioner="multigrid"), prdp.Direct(), prdp.MINRES(200)], ids=repr)
+def test_every_solver_knows_the_level_of_each_part(solver, way):
+    """Of the second sample the cavity has two closed parts, of the others one; alone they take the same iterations."""
+    shape, solids, settings = CASES["cavity"]
+    u = noise(3, 2, *shape, seed=3)
+
+    def run(obstacle, u):
+        flow = prdp.Flow(shape, dt=0.01, obstacle=obstacle, solver=solver, **settings)
+        return *flow.step_and_pressure(u), flow.info
+
+    with WAYS[way]() if not isinstance(solver, prdp.Direct) else contextlib.nullcontext():
+        v, p, info = run(torch.stack(solids), u)
+        for i, solid in enumerate(solids):
+            one_v, one_p, one_info = run(solid, u[[i]])
+            torch.testing.assert_close((v[[i]], p[[i]]), (one_v, one_p), rtol=1e-9, atol=1e-11)
+            assert abs(info.iterations[i] - one_info.iterations[0]) <= 1
+    assert (info.status > 0).all()
+
+
+def test_gradcheck():
+    shape, solids, _ = CASES["pockets"]
+    inflow = torch.tensor([0.5, 0.1], dtype=F64, requires_grad=True)
+    nu = torch.tensor([0.05, 0.2, 0.1], dtype=F64, requires_grad=True)
+    u = (0.3 * noise(3, 2, *shape)).requires_grad_()
+    flow = prdp.Flow(shape, nu, 0.01, boundary=("wall", "open"), inflow=inflow, obstacle=torch.stack(solids),
+                     solver=prdp.CG(200, 1e-13))  # fmt: skip
+
+    def run(u, nu, inflow):
+        flow.nu, flow.inflow = nu, inflow
+        return flow.step_and_pressure(u)
+
+    torch.autograd.gradcheck(run, (u, nu, inflow), rtol=1e-4, atol=1e-6)
+
+
+def test_a_sample_without_an_obstacle_is_the_box_alone():
+    solids = torch.stack([block(WIDE, (2, 2)), block(WIDE)])
+    u = noise(2, 2, *WIDE)
+    settings = {"boundary": "wall", "solver": prdp.CG(200, 1e-13)}
+    both = prdp.Flow(WIDE, 0.01, 0.01, obstacle=solids, **settings)(u)
+    torch.testing.assert_close(both[[1]], prdp.Flow(WIDE, 0.01, 0.01, **settings)(u[[1]]), rtol=1e-10, atol=1e-12)
+
+
+def test_a_sample_whose_step_is_too_long_leaves_its_neighbours_alone():
+    shape, solids, settings = CASES["cavity"]
+    obstacle = torch.stack(solids)
+    u = 0.1 * noise(3, 2, *shape)
+    u[1] *= 1e3
+    flow = prdp.Flow(shape, dt=0.01, obstacle=obstacle, on_failure="return", **settings)
+    v = flow(u)
+    assert statuses(flow.info) == ["CONVERGED", "DIVERGED", "CONVERGED"] and (v[1] == 0).all()
+    alone = prdp.Flow(shape, dt=0.01, obstacle=obstacle[[0, 2]], **settings)(u[[0, 2]])
+    assert torch.equal(v[[0, 2]], alone)
+
+
+def test_one_obstacle_of_a_batch_is_for_all_samples():
+    solid = block(PLANE, (2, 2))
+    u = noise(3, 2, *PLANE)
+    one, other = (prdp.Flow(PLANE, 0.01, 0.01, obstacle=mask)(u) for mask in (solid, solid[None]))
+    assert torch.equal(one, other)
+
+
+def test_samples_are_counted_and_named():
+    solids = torch.stack([block(PLANE, (2, 2)), ~block(PLANE)])
+    with pytest.raises(ValueError, match="Flow: the obstacle of sample 1 fills the grid"):
+        prdp.Flow(PLANE, 0.01, 0.01, obstacle=solids)
+    with pytest.raises(ValueError, match=r"must have the shape of the grid, \[5, 6\], or \(batch or 1\) of them"):
+        prdp.Flow(PLANE, 0.01, 0.01, obstacle=solids[None])
+    flow = prdp.Flow(PLANE, 0.01, 0.01, obstacle=solids[[0, 0]])
+    with pytest.raises(ValueError, match="Flow: obstacle holds 2 samples, u holds 3"):
+        flow(noise(3, 2, *PLANE))
+    none = prdp.Flow(PLANE, 0.01, 0.01, obstacle=solids[:0])
+    assert none(noise(0, 2, *PLANE)).shape == (0, 2, *PLANE)
+
+
+def test_obstacles_go_into_state_dicts_and_may_change():
+    solids = torch.stack(CASES["periodic"][1])
+    u = noise(3, 2, *PLANE)
+    flow = prdp.Flow(PLANE, 0.01, 0.01, obstacle=solids)
+    first = flow(u)
+    other = prdp.Flow(PLANE, 0.01, 0.01, obstacle=torch.zeros_like(solids))
+    other.load_state_dict(flow.state_dict())
+    assert torch.equal(other(u), first)
+    flow.obstacle = solids.flip(0)
+    assert torch.equal(flow(u.flip(0)).flip(0), first)
