@@ -157,3 +157,17 @@ def test_a_smooth_load_on_many_points_of_a_line_is_solved_though_its_residual_is
         u = step(scale * exact.view(1, 1, n))[0, 0]
         assert step.info.status.item() == prdp.SolveStatus.STAGNATED and step.info.solved.all()
         torch.testing.assert_close(u, exact, rtol=0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("jitter", [1e-2, 1e-3, 1e-4])
+def test_refining_never_hands_out_a_worse_solution(jitter):
+    """Of a kernel matrix in float32 the first solve, whose factors are in float64, is the most accurate."""
+    x = torch.linspace(0, 1, 100)
+    kernel = torch.exp(-((x[:, None] - x) ** 2) / 0.08) + jitter * torch.eye(100)
+    y = torch.sin(6 * x) + 0.1 * noise(100).float()
+    exact = torch.linalg.solve(kernel.double(), y.double())
+    first, *refined = (prdp.linear_solve(kernel, y, prdp.Direct(max_iter=m)) for m in (1, 2, 5))
+    assert (first[0] - exact).norm() < 1e-6 * exact.norm()
+    for u, info in refined:
+        assert info.residual <= first[1].residual and info.solved
+        assert (u - exact).norm() < 1e-6 * exact.norm() or info.residual < first[1].residual

@@ -108,12 +108,12 @@ WAYS = {
                       [(m, o) for m, o in PAIRS
                        if m in DIVIDING and o in ("NavierStokes", "Stencil", "Matrix", "CSR")]),
     "turn": ("BREAKDOWN", r" \(the iterate handed out has relative residual [\d.e-]+ after \d+ iterations\), ",
-             f"r·A r is zero for a residual r(: {KRYLOV}|; take GMRES)",
+             f"r·A r is zero for a residual r(: {KRYLOV}|, or u grew without end; take GMRES)",
              [(m, o) for m in ("SteepestDescent", "CG", "BiCGStab") for o in ("Function", "Matrix", "CSR")]),
     "singular": ("BREAKDOWN", r" \(the iterate .*\), ",
                  "(A is singular to float64, or nearly so; GMRES solves it"
                  "|.*A is singular, and b lies outside its range[;,].* take a b"
-                 f"|.*{KRYLOV}|r·A r is zero for a residual r; take GMRES)",
+                 f"|.*{KRYLOV}|r·A r is zero for a residual r, or u grew without end; take GMRES)",
                  [(m, o) for m in ("CG", "BiCGStab", "GMRES(3)", "Direct") for o in ("Function", "Matrix", "CSR")]
                  + [(m, o) for m in DIVIDING if m != "Jacobi" for o in ("Matrix", "CSR")]),
     "strong": ("DIVERGED", r" \(the iterate .*\), ",

@@ -8,6 +8,8 @@ import torch
 import prdp_torch as prdp
 from prdp_torch import operators
 
+F64 = torch.float64
+
 
 def rings(parts, n, dtype, seed=0):
     """The Laplacian of `parts` rings of n nodes with weights that require grad, dense; these; its null vectors."""
@@ -86,3 +88,36 @@ def test_a_vector_that_is_no_null_vector_is_named_among_many():
     a = operators.Matrix(dense(entries, 40).detach(), nullspace=vectors)
     with pytest.raises(ValueError, match="vector 3 of nullspace is not in the null space of A"):
         prdp.linear_solve(a, torch.zeros(40, dtype=torch.float64), prdp.CG(2))
+
+
+@pytest.mark.parametrize("restart", [10, 30, 60])
+def test_gmres_fails_where_a_null_vector_is_missing(restart):
+    """Three graphs, of which the constant alone is named: b has no part outside the range, its cotangent has."""
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.block_diag(*[torch.rand(20, 20, dtype=F64, generator=generator) for _ in range(3)])
+    weights = (weights + weights.mT).fill_diagonal_(0)
+    laplacian = torch.diag(weights.sum(1)) - weights
+    b = torch.randn(1, 3, 20, dtype=F64, generator=generator)
+    b = (b - b.mean(2, keepdim=True)).flatten(1).requires_grad_()
+    a = operators.Matrix(laplacian, nullspace="constant")
+    solver = prdp.GMRES(500, 1e-12, restart=restart)
+    u, info = prdp.linear_solve(a, b, solver)
+    assert info.solved.all()
+    torch.testing.assert_close(u.mT, torch.linalg.pinv(laplacian, hermitian=True) @ b.mT, rtol=0, atol=1e-9)
+    with pytest.raises(torch.linalg.LinAlgError, match=r"adjoint solve: 1 of 1 samples failed: sample 0 BREAKDOWN"):
+        (u**3).sum().backward()
+    u, info = prdp.linear_solve(a, b, solver, on_failure="zero_grad")
+    (u**3).sum().backward()
+    assert (b.grad == 0).all() and info.adjoint.failed.all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bicgstab_fails_where_u_grows_along_a_null_vector(seed):
+    generator = torch.Generator().manual_seed(seed + 4)
+    a = 3 * torch.eye(30, dtype=F64) + 0.5 * torch.randn(30, 30, dtype=F64, generator=generator)
+    q = torch.nn.functional.normalize(torch.randn(30, dtype=F64, generator=generator), dim=0)
+    a = a - torch.outer(a @ q, q)
+    b = torch.randn(3, 30, dtype=F64, generator=generator)
+    u, info = prdp.linear_solve(a, b, prdp.BiCGStab(100, 1e-8), on_failure="return")
+    grown = u.norm(dim=1) > 1e13
+    assert not (grown & ~info.failed).any() and not info.solved.any()

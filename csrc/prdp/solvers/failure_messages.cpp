@@ -184,7 +184,8 @@ std::string breakdown(const FailedSample& sample) {
   if (sample.method().made_for == MadeFor::kDefinite) return definite_breakdown(sample);
   if (sample.method().made_for == MadeFor::kSymmetric) return minres_breakdown(sample);
   if (maps_ones_to_zero(sample)) return "its preconditioner maps a vector of ones to zero; look at what M⁻¹ is made of";
-  if (sample.method().counts == Counts::kIterations) return "r·A r is zero for a residual r; take GMRES";
+  if (sample.method().counts == Counts::kIterations)
+    return "r·A r is zero for a residual r, or u grew without end; take GMRES";
   const char* remedy = sample.is_single() ? "float32; take float64 to tell, or" : "float64; if it is singular, take";
   return c10::str(
       "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range, "
@@ -217,6 +218,9 @@ std::string max_iter_reached(const FailedSample& sample) {
   if (auto found = unfit(sample); !found.empty()) return found;
   const bool single = sample.is_single();
   if (loses_coarse_grids(sample)) return kLostCoarseGrids;
+  if (sample.preconditioner().is_multigrid() && asymmetric(sample).empty())
+    return "its cycles are slow where coefficients jump from cell to cell; take more iterations, \"diagonal\" or "
+           "Direct";
   if (sample.preconditioner().is_multigrid())
     return "its cycles may not be made for this A, as for a wind in central differences that is strong beside the "
            "diffusion; take upwind differences, leave out multigrid, or take Direct";

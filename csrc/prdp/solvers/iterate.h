@@ -141,6 +141,41 @@ void judge_numerical_singularity(Space& space, const Method& method, typename Sp
     if (s.returned != Returned::kLast) s.status = SolveStatus::kBreakdown;
 }
 
+/// Methods whose u may grow along a null vector of A that nobody named: those for any A, or any symmetric one.
+template <class Method>
+inline constexpr bool kMayGrow = kMayExhaust<Method> || (kHasRecursiveResidual<Method> && !kDescendsEnergy<Method>);
+
+/// Which samples are far from solved, and have a u so large that A u rounds by much beside b: it has grown.
+template <class Space, class Method>
+auto have_grown(Space& space, const Method& method, const typename Space::States& states) {
+  const auto floors = rounding_floors(space, method);
+  // All but GMRES may be on their way, in a system as badly conditioned: they are given a hundred times as much.
+  const double bound = std::min(0.25, largest_floor(space) * (kMayExhaust<Method> ? 1.0 : 100.0));
+  auto grown = space.map(states, [](const SampleState&) { return false; });
+  for (size_t i = 0; i < states.size(); ++i) {
+    const auto& s = states[i];
+    grown[i] = s.floor2 == 0.0 && s.residual2 > 1e-4 * s.b2 && floors[i] > bound * std::sqrt(s.b2);
+  }
+  return grown;
+}
+
+/// Where u has grown at the end, as of GMRES that stagnated, A is singular to the dtype, and zero replaces u.
+template <class Space, class Method>
+void judge_growth(Space& space, const Method& method, typename Space::States& states) {
+  const auto is_doubtful = [](const SampleState& s) {
+    const bool ended = kMayExhaust<Method> ? s.status == SolveStatus::kStagnated : is_unsolved(s.status);
+    return ended && s.returned == Returned::kLast && s.residual2 > 1e-4 * s.b2;
+  };
+  if (std::none_of(states.begin(), states.end(), is_doubtful)) return;
+  const auto grown = have_grown(space, method, states);
+  for (size_t i = 0; i < states.size(); ++i) {
+    auto& s = states[i];
+    if (!is_doubtful(s) || !grown[i]) continue;
+    s.returned = Returned::kZero;
+    s.status = SolveStatus::kBreakdown;
+  }
+}
+
 /// Which iterate each sample is to hand out; returns whether all hand out their last.
 template <class Space, class Method>
 bool choose_answers(Space& space, Method& method, typename Space::States& states, bool track) {
@@ -151,11 +186,13 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
   accept_at_rounding_floor(space, method, states);
   if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states);
   if constexpr (kDescendsEnergy<Method>) accept_by_energy(space, method, states);
+  if constexpr (kMayGrow<Method>) judge_growth(space, method, states);
   bool all_last = true;
   for (auto& s : states) {
     if (s.returned == Returned::kLast) {
       if (ran_away(s)) s.returned = Returned::kBestOrZero;
-      else if (left_rounding_of_b(s)) s.returned = Returned::kBest;
+      else if (left_rounding_of_b(s) || (kIsExact<Method> && s.floor2 > 0.0 && was_better(s)))
+        s.returned = Returned::kBest;
       else if (!track && s.status == SolveStatus::kBreakdown) s.returned = Returned::kBeforeBreakdown;
     }
     all_last = all_last && s.returned == Returned::kLast;
@@ -206,6 +243,20 @@ void take_least_of_halves(Space& space, Method& method, typename Space::States& 
   conclude(space, method, states, rtol);
 }
 
+/// Takes zero in place of a best iterate that has grown.
+template <class Space, class Method>
+void drop_grown(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
+  const auto found = states;
+  const auto has_grown = have_grown(space, method, states);
+  const auto is_dropped = [&](size_t i) { return has_grown[i] && found[i].returned == Returned::kBestOrZero; };
+  bool any = false;
+  for (size_t i = 0; i < states.size(); ++i) any = any || is_dropped(i);
+  if (!any) return;
+  run_again(space, method, states, rtol, track,
+            [&](size_t i) { return is_dropped(i) ? int64_t{0} : found[i].iterations; });
+  conclude(space, method, states, rtol);
+}
+
 /// Makes the iterates that are to be handed out in place of the last ones, by the same steps as before: a
 /// method that went on from its true residual does so again. Where no residual was looked at, a pass that tracks them
 /// finds the best one, or the iteration that broke down. The other samples keep what they have. The cold path.
@@ -221,6 +272,7 @@ void replay(Space& space, Method& method, typename Space::States& states, double
   });
   conclude(space, method, states, rtol);
   take_least_of_halves(space, method, states, rtol, track);
+  if constexpr (kMayGrow<Method>) drop_grown(space, method, states, rtol, track);
 
   const auto is_remade = space.map(states, [](const SampleState& s) { return s.returned != Returned::kLast; });
   for (size_t i = 0; i < states.size(); ++i) {

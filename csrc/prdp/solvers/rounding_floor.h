@@ -18,6 +18,12 @@ auto rounding_floors(Space& space, const Method& method) {
   return floors;
 }
 
+/// A floor beyond this share of ‖b‖ means that u has grown along a null vector that nobody named, or nearly one.
+template <class Space>
+double largest_floor(const Space& space) {
+  return space.epsilon() < 1e-10 ? 1e-5 : 0.25;
+}
+
 /// Sweeps or cycles without progress for so long may be at their rounding, which takes a closer look.
 template <class Method>
 bool is_idle(const SampleState& s) {
@@ -37,18 +43,16 @@ double slack_of_floor(const SampleState& s, double rtol, double floor) {
 }
 
 /// The floor of each `doubtful` sample whose residual is at most slack_of_floor() floors; 0 for the others. Never of a
-/// residual above ‖b‖/10, as u is garbage then, nor a floor above ‖b‖/4; in float64 none above 1e-5 ‖b‖, which a u has
-/// that grew along a null vector that nobody named.
+/// residual above ‖b‖/10, as u is garbage then, nor a floor above largest_floor().
 template <class Space, class Method, class Predicate>
 auto floors_of_suspects(Space& space, const Method& method, const typename Space::States& states, double rtol,
                         const Predicate& doubtful) {
   const auto all_floors = rounding_floors(space, method);
-  const double largest_floor = space.epsilon() < 1e-10 ? 1e-5 : 0.25;
   auto floors = space.map(states, [](const SampleState&) { return 0.0; });
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
     const double floor = all_floors[i], b = std::sqrt(s.b2), residual = std::sqrt(s.residual2);
-    const bool is_plausible = floor <= largest_floor * b && residual <= 0.1 * b;
+    const bool is_plausible = floor <= largest_floor(space) * b && residual <= 0.1 * b;
     if (doubtful(s) && is_plausible && residual <= slack_of_floor<Method>(s, rtol, floor) * floor) floors[i] = floor;
   }
   return floors;

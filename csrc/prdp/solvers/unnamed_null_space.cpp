@@ -49,13 +49,16 @@ at::Tensor suspects_of(const SolveInfo& info, const SolveRequest& request) {
   const int64_t batch = info.status.size(0);
   const auto* status = info.status.const_data_ptr<int64_t>();
   const auto* products = info.operator_applications.const_data_ptr<int64_t>();
+  const auto* iterations = info.iterations.const_data_ptr<int64_t>();
   const auto is_above_b = [&](int64_t i) {
     return info.residual.scalar_type() == at::kFloat ? info.residual.const_data_ptr<float>()[i] > 1.0F
                                                      : info.residual.const_data_ptr<double>()[i] > 1.0;
   };
   at::Tensor suspects;
   for (int64_t i = 0; i < batch; ++i) {
-    if (!is_unsolved(static_cast<SolveStatus>(status[i]))) continue;
+    const auto ended = static_cast<SolveStatus>(status[i]);
+    const bool has_grown = ended == SolveStatus::kBreakdown && !traits(solver.method).is_direct && iterations[i] == 0;
+    if (!is_unsolved(ended) && !has_grown) continue;
     if (!rounding_grows_fast(solver) && products[i] < kFewProducts && !is_above_b(i)) continue;
     if (!suspects.defined()) suspects = at::zeros({batch}, at::kBool);
     suspects.mutable_data_ptr<bool>()[i] = true;

@@ -78,6 +78,9 @@ inline bool left_rounding_of_b(const SampleState& s) {
   return s.best2 > 0.0 && s.best2 <= s.rounding2 && s.residual2 > 4.0 * s.rounding2;
 }
 
+/// It went on and got worse: of a direct method, whose first solve is the most accurate where refining adds rounding.
+inline bool was_better(const SampleState& s) { return s.best > 0 && s.best < s.iterations && s.residual2 > s.best2; }
+
 /// The residual is above ‖b‖: zero would be a better answer.
 inline bool is_above_b(const SampleState& s, double epsilon) { return s.residual2 > (1.0 + 256.0 * epsilon) * s.b2; }
 
