@@ -47,7 +47,7 @@ def test_short_steps_from_the_state_are_said_with_what_they_leave_out(make, alwa
     assert len(told) == 1 and "1000 of 1000 steps took no iteration" in told[0] and 'start="zero"' in told[0]
     lost = float(told[0].split("as much as ")[1].split(" ")[0])
     assert 0.2 * change.max() < lost < 3 * change.max()
-    rtol = float(told[0].split("such as ")[1].split(",")[0])
+    rtol = float(told[0].split("such as ")[1].split(". ")[0])
     tight.rtol = rtol
     found, silent = said(lambda: tight.rollout(u, 1000))
     assert not silent and (found[:, -1] - exact[:, -1]).norm() < 0.05 * (exact[:, -1] - u).norm()

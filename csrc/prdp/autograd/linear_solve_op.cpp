@@ -224,7 +224,7 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
   const SolveRole role{spec, s, spec.transposed, x0};
   report_failures(role, *a, b, info, options.on_failure);
   if (options.on_failure == OnFailure::kRaise || options.on_failure == OnFailure::kWarn)
-    warn_of_uneven_rows(role, *a, rhs, result);
+    warn_of_uneven_rows(role, *a, rhs, result, /*looks_at_channels=*/!options.channels_are_components);
   if (looks_at_product) warn_of_nonlinear_product(spec, b, result.u, info.residual);
   for (auto* part : info.parts())
     if (part->device() != b.device()) *part = part->to(b.device());

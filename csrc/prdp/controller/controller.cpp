@@ -90,8 +90,8 @@ std::string Controller::about_residual() const {
   const auto& history = state().history;
   if (idle_ > 0.5)
     return std::string(name()) +
-           ": most of the last solves took no iteration, as their start met rtol. Steps in time then hardly change the "
-           "state: start them from zero, solve for the change of the state, or take a finer rtol";
+           ": most of the last solves took no iteration, as their start met rtol: what is trained, or a step in time, "
+           "hardly changes their solution. Start them from zero, solve for the change, or take a finer rtol";
   if (history.empty() || !history.back().residual) return {};
   const auto& last = history.back();
   const double residual = *last.residual;

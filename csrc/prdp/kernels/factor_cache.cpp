@@ -1,7 +1,6 @@
 #include "prdp/kernels/factor_cache.h"
 
 #include <pthread.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <atomic>
@@ -115,10 +114,7 @@ void make_room(std::vector<Kept>& gone) {
 
 }  // namespace
 
-int64_t limit() {
-  static const int64_t memory = static_cast<int64_t>(sysconf(_SC_PHYS_PAGES)) * sysconf(_SC_PAGE_SIZE);
-  return std::clamp(memory / 8, int64_t{1} << 29, int64_t{1} << 32);
-}
+int64_t limit() { return int64_t{1} << 30; }
 int64_t bytes_kept() {
   const std::lock_guard lock(mutex);
   return bytes_of_all;

@@ -65,7 +65,6 @@ void clear();
 /// How many calls of find_or_make() had to make it.
 int64_t count_made();
 void count_one();
-/// An eighth of the machine's memory, between 512 MiB and 4 GiB.
 int64_t limit();
 int64_t bytes_kept();
 

@@ -72,11 +72,12 @@ void warn_of_small_channels(const Look& look) {
       at::where(is_there, norms(look.residual) / of_b, 0.0).masked_fill(look.converged.logical_not().unsqueeze(1), 0.0);
   const auto worst = shares.argmax().item<int64_t>(), channels = shares.size(1);
   const double share = shares.flatten()[worst].item<double>();
-  if (!(share > look.much())) return;
+  constexpr double much = 0.05;
+  if (!(share > much)) return;
   warn_once(look.key("small channels"), share, [&](std::ostream& text) {
     text << look.beginning(worst / channels) << "in channel " << worst % channels << " alone |b - A u| is "
          << three_digits(share) << " |b|: its b is much smaller than that of another channel, and all channels have "
-         << "one stopping test. Solve them as samples, as with b.flatten(0, 1).unsqueeze(1), or take "
+         << "one stopping test. Make the channels samples, of b and of A, or take "
          << in_language("Direct()", "Direct{}");
   });
 }
@@ -101,10 +102,11 @@ void warn_of_small_rows(const Look& look, const Operator& a) {
 
 }  // namespace
 
-void warn_of_uneven_rows(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveResult& result) {
+void warn_of_uneven_rows(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveResult& result,
+                         bool looks_at_channels) {
   const auto& solver = role.solver;
   const bool looks_at_rows = !is_function(role.a) && !has_even_rows(role.a);
-  const bool looks_at_channels = has_channels_apart(role.a, b);
+  looks_at_channels = looks_at_channels && !role.adjoint && has_channels_apart(role.a, b);
   if (!(solver.rtol > 0.0) || traits(solver.method).is_direct || (!looks_at_rows && !looks_at_channels)) return;
   if (!b.is_cpu() || gpu::runtime_of(b.device()) || b.numel() == 0 || !is_plain(b) || !all_plain(role.a.tensors))
     return;

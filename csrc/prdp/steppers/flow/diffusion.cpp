@@ -22,7 +22,8 @@ std::vector<OperatorSpec> diffusion_operators(const FlowEquation& e, const at::T
 }
 
 FlowParts diffuse(const FlowEquation& equation, const std::vector<OperatorSpec>& operators, const at::Tensor& change,
-                  const SolveOptions& options, CombinedInfo& info) {
+                  SolveOptions options, CombinedInfo& info) {
+  options.channels_are_components = true;
   const auto width = change.size(1) / static_cast<int64_t>(operators.size());
   FlowParts parts;
   for (size_t k = 0; k < operators.size(); ++k)

@@ -10,7 +10,7 @@ std::vector<OperatorSpec> diffusion_operators(const FlowEquation& equation, cons
 /// (I - ν dt Δ)⁻¹ of a change of the velocity that is zero on the faces which are not free. Differentiable. Where
 /// kernels take it on, what a preconditioner leaves on the other faces is still there.
 FlowParts diffuse(const FlowEquation& equation, const std::vector<OperatorSpec>& operators, const at::Tensor& change,
-                  const SolveOptions& options, CombinedInfo& info);
+                  SolveOptions options, CombinedInfo& info);
 /// The cotangents of `change` and of ν from that of the result. ν's is undefined without the result.
 struct DiffuseVjp {
   FlowParts change;
