@@ -238,3 +238,34 @@ def test_null_vectors_that_nobody_named_are_counted():
     of_samples = torch.stack([vectors, vectors * torch.tensor([[1.0], [0.0], [0.0]])])
     assert prdp.check_operator(operators.Matrix(both, nullspace=of_samples), example)
     assert prdp.check_operator(operators.Matrix(torch.diag(10.0 ** torch.arange(0, -15, -1).double())), example)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("seed", range(3))
+def test_jumps_and_still_water_are_no_mistakes(seed, dtype):
+    """Harmonic means are homogeneous, and upwind schemes have a kink where the wind is zero."""
+    generator = torch.Generator().manual_seed(seed)
+    pad = torch.nn.functional.pad
+
+    def harmonic(v, k):
+        flux = 2 * k[:, 1:] * k[:, :-1] / (k[:, 1:] + k[:, :-1]) * v.diff(dim=1)
+        return 1e-3 * v - (pad(flux, (0, 1)) - pad(flux, (1, 0)))
+
+    def upwind(v, c):
+        return v + c.clamp(min=0) * (v - v.roll(1, 1)) + c.clamp(max=0) * (v.roll(-1, 1) - v)
+
+    half = torch.rand(1, 60, generator=generator) < 0.5
+    small = 1e-5 if dtype == torch.float32 else 1e-10
+    k = torch.where(half, 1.0, small).to(dtype).requires_grad_()
+    c = torch.where(half, torch.randn(1, 60, generator=generator), 0.0).to(dtype).requires_grad_()
+    example = torch.zeros(1, 60, dtype=dtype)
+    assert prdp.check_operator(operators.Function(harmonic, tensors=(k,), symmetric=True), example)
+    assert prdp.check_operator(operators.Function(upwind, tensors=(c,)), example)
+
+
+@pytest.mark.parametrize("n", [64, 256])
+def test_a_bad_condition_is_no_null_space(n):
+    rows = torch.tensor([2.0, -1.0, -1.0]).view(1, 3, 1).expand(1, 3, n)
+    for dtype in (torch.float32, torch.float64):
+        a = operators.Stencil(rows.to(dtype), [(0,), (-1,), (1,)])
+        assert prdp.check_operator(a, torch.zeros(1, 1, n, dtype=dtype))
