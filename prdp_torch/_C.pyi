@@ -45,6 +45,8 @@ class FlowBox:
     """
     def __init__(self, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], boundary: collections.abc.Sequence[str], length: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], obstacle: torch.Tensor | None) -> None:
         ...
+    def fill_pockets(self, obstacle: torch.Tensor) -> torch.Tensor:
+        ...
 class FlowEquation:
     """
     A flow and how it is stepped.

@@ -62,9 +62,9 @@ class Flow(HoldsTensors, Stepper):
         backward and the other options: as in `Stepper`, but `start` must be "zero".
 
     All but `shape` may be set at any time, `pressure` by the name `pressure_form`. A tensor that is set later as `nu`,
-    `force`, `inflow` or `wall_velocity`, such as the output of a network, is used in the steps that follow but not
-    saved: copies and `state_dict` keep the earlier value. Parameters, buffers and `obstacle` are saved; plain numbers
-    go into copies, not into `state_dict`.
+    `force`, `inflow` or `wall_velocity`, such as the output of a network, and obstacles of samples are used in the
+    steps that follow but not saved: copies and `state_dict` keep the earlier value. Parameters, buffers and an
+    obstacle of all samples are saved; plain numbers go into copies, not into `state_dict`.
 
     `info` combines the solves of a step: it has the sum of their iterations, the worst status and the largest residual.
     Each step stores one state for the backward pass, and computes the rest again.
@@ -137,6 +137,9 @@ class Flow(HoldsTensors, Stepper):
                 self._set(name, _checked(name, value))
             elif name in TENSORS:
                 self._hold(name, _checked(name, value))
+            elif name == "obstacle" and (value is None or isinstance(value, Tensor)):
+                of_samples = isinstance(value, Tensor) and value.dim() > len(self.shape)
+                (self._set if of_samples else self._hold)(name, value)
             elif name == "pressure":
                 raise AttributeError("Flow: pressure is a method; the form of the argument is set by pressure_form")
             else:
@@ -228,6 +231,15 @@ class Flow(HoldsTensors, Stepper):
         cells before an open end, whose high faces take what mass conservation gives. NaN in u remains."""
         return self._equation().divergence(_field("Flow", "u", u))
 
+    def fill_pockets(self, obstacle: Tensor) -> Tensor:
+        """Return an obstacle, bool (*shape) or (batch, *shape), with the fluid filled that nothing flows through: all
+        but its largest connected part or, with an open axis, the parts that join its two ends. Such pockets take time,
+        and at an open end a `Flow` refuses them. Raises ValueError or TypeError for another shape or dtype, or where
+        no fluid is left."""
+        d = len(self.shape)
+        box = _C.FlowBox(list(self.shape), list(_of_axes("boundary", self.boundary, d)), [1.0] * d, None)
+        return box.fill_pockets(_check.dense("Flow", "obstacle", obstacle))
+
     def _equation(self) -> _C.FlowEquation:
         nu, dt = full_precision(real_tensor("Flow", "nu", self.nu)), _check.real("Flow", "dt", self.dt)
         force = _check.optional(_field, "Flow", "force", self.force)
@@ -243,7 +255,8 @@ class Flow(HoldsTensors, Stepper):
         return _C.FlowEquation(box, dt, nu, force, inflow, walls, self.advection, self.diffusion, self.pressure_form)
 
     def extra_repr(self) -> str:
-        return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {super().extra_repr()}"
+        obstacle = "" if self.obstacle is None else f"obstacle={tuple(self.obstacle.shape)}, "
+        return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {obstacle}{super().extra_repr()}"
 
 
 def _checked(name: str, value: object) -> object:

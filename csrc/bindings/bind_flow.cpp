@@ -2,6 +2,7 @@
 
 #include "bindings.h"
 #include "prdp/operators/autocast.h"
+#include "prdp/steppers/flow/boundaries.h"
 #include "prdp/steppers/flow/flow.h"
 #include "prdp/steppers/flow/rollout.h"
 #include "solves.h"
@@ -54,7 +55,8 @@ py::tuple report(const Solve& solve) {
 
 void bind_flow(py::module_& m) {
   py::class_<FlowBox, std::shared_ptr<FlowBox>>(m, "FlowBox", "The grid of a flow, its boundary and its obstacle.")
-      .def(py::init(&make_box), py::arg("shape"), py::arg("boundary"), py::arg("length"), py::arg("obstacle"));
+      .def(py::init(&make_box), py::arg("shape"), py::arg("boundary"), py::arg("length"), py::arg("obstacle"))
+      .def("fill_pockets", &fill_pockets, py::arg("obstacle"));
   py::class_<FlowEquation>(m, "FlowEquation", "A flow and how it is stepped.")
       .def(py::init(&make_equation), py::arg("box"), py::arg("dt"), py::arg("nu"), py::arg("force"), py::arg("inflow"),
            py::arg("wall_velocity"), py::arg("advection"), py::arg("diffusion"), py::arg("pressure"))

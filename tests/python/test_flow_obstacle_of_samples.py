@@ -1,6 +1,7 @@
 """`Flow` with an obstacle for each sample, (batch, *shape). Each sample has the result that it has alone."""
 
 import contextlib
+import copy
 
 import pytest
 import torch
@@ -144,12 +145,52 @@ def test_gradcheck():
     torch.autograd.gradcheck(run, (u, nu, inflow), rtol=1e-4, atol=1e-6)
 
 
-def test_a_sample_without_an_obstacle_is_the_box_alone():
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("form", ["incremental", "plain"])
+@pytest.mark.parametrize("nu", [0.01, 2.0, 9.0])  # up to where a share of the pressure stays, with an obstacle or not
+@pytest.mark.parametrize("boundary", ["periodic", "wall", ("wall", "open"), ("slip", "periodic")], ids=repr)
+def test_a_sample_without_an_obstacle_is_the_box_alone(boundary, nu, form, way):
     solids = torch.stack([block(WIDE, (2, 2)), block(WIDE)])
+    inflow = (0.3, 0.0) if "open" in boundary else None
+    weights = noise(2, 3, *WIDE, seed=4)
+
+    def run(obstacle, u, weights):
+        viscosity = torch.tensor([nu], dtype=F64).expand(len(u)).clone().requires_grad_()
+        step = prdp.Flow(WIDE, viscosity, 0.01, boundary=boundary, inflow=inflow, obstacle=obstacle, pressure=form,
+                         solver=prdp.CG(200, 1e-13))  # fmt: skip
+        u = u.clone().requires_grad_()
+        found = torch.cat(step.step_and_pressure(step.project(u)), 1)
+        return found.detach(), *torch.autograd.grad(found, (u, viscosity), weights)
+
     u = noise(2, 2, *WIDE)
-    settings = {"boundary": "wall", "solver": prdp.CG(200, 1e-13)}
-    both = prdp.Flow(WIDE, 0.01, 0.01, obstacle=solids, **settings)(u)
-    torch.testing.assert_close(both[[1]], prdp.Flow(WIDE, 0.01, 0.01, **settings)(u[[1]]), rtol=1e-10, atol=1e-12)
+    with WAYS[way]():
+        both, alone = run(solids, u, weights), run(None, u[[1]], weights[[1]])
+        other = run(solids[0], u[[0]], weights[[0]])
+    for mine, empty, solid in zip(both, alone, other, strict=True):
+        torch.testing.assert_close(mine[[1]], empty, rtol=1e-8, atol=1e-9)
+        torch.testing.assert_close(mine[[0]], solid, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_porous_samples_with_many_pockets_are_as_alone(way):
+    """More closed parts than are taken off one by one."""
+    shape = (12, 13)
+    generator = torch.Generator().manual_seed(5)
+    solids = torch.rand(3, *shape, generator=generator) < torch.tensor([0.5, 0.3, 0.0]).view(3, 1, 1)
+    u = noise(3, 2, *shape)
+
+    def run(obstacle, u):
+        step = prdp.Flow(shape, 0.05, 0.01, boundary="wall", obstacle=obstacle, solver=prdp.CG(300, 1e-12))
+        u = u.clone().requires_grad_()
+        v, p = step.step_and_pressure(u)
+        assert step.info.solved.all()
+        return v, p, torch.autograd.grad(v.square().sum() + (p * noise(3, 1, *shape)[: len(u)] * 0).sum(), u)[0]
+
+    with WAYS[way]():
+        together = run(solids, u)
+        for i in range(3):
+            for mine, alone in zip(together, run(solids[i], u[[i]]), strict=True):
+                torch.testing.assert_close(mine[[i]], alone, rtol=1e-7, atol=1e-8)
 
 
 def test_a_sample_whose_step_is_too_long_leaves_its_neighbours_alone():
@@ -194,3 +235,83 @@ def test_obstacles_go_into_state_dicts_and_may_change():
     assert torch.equal(other(u), first)
     flow.obstacle = solids.flip(0)
     assert torch.equal(flow(u.flip(0)).flip(0), first)
+
+
+def test_obstacles_that_are_set_for_a_batch_are_not_saved():
+    """A network's model loads, and its average goes on, whatever the last batch was."""
+    solids = torch.stack(CASES["periodic"][1])
+    flow = prdp.Flow(PLANE, 0.01, 0.01)
+    for samples in ([0, 1, 2], [0, 1]):
+        flow.obstacle = solids[samples]
+        assert torch.equal(flow.obstacle, solids[samples])
+        flow(noise(len(samples), 2, *PLANE))
+        assert "obstacle" not in flow.state_dict() and copy.deepcopy(flow).obstacle is None
+    assert "obstacle=(2, 5, 6)" in repr(flow)
+    flow.obstacle = solids[0]
+    assert torch.equal(flow.state_dict()["obstacle"], solids[0]) and torch.equal(flow.obstacle, solids[0])
+    flow.obstacle = solids
+    assert torch.equal(copy.deepcopy(flow).obstacle, solids[0])
+    flow.obstacle = None
+    assert flow.obstacle is None and "obstacle" not in flow.state_dict()
+
+
+def reached(solid, periodic, start):
+    """The cells that fluid reaches from some, by walking."""
+    found, todo = set(start), list(start)
+    while todo:
+        y, x = todo.pop()
+        for step in ((y - 1, x), (y + 1, x), (y, x - 1), (y, x + 1)):
+            cell = tuple(c % n if wraps else c for c, n, wraps in zip(step, solid.shape, periodic, strict=True))
+            inside = all(0 <= c < n for c, n in zip(cell, solid.shape, strict=True))
+            if inside and not solid[cell] and cell not in found:
+                found.add(cell)
+                todo.append(cell)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("boundary", ["periodic", "wall", ("wall", "open"), ("periodic", "open")], ids=repr)
+def test_pockets_are_filled(boundary, seed):
+    shape = (10, 12)
+    is_open = "open" in boundary
+    solids = torch.rand(4, *shape, generator=torch.Generator().manual_seed(seed)) < (0.2 if is_open else 0.35)
+    flow = prdp.Flow(shape, 0.01, 1e-3, boundary=boundary, inflow=(0.5, 0.0) if is_open else None)
+    filled = flow.fill_pockets(solids)
+    names = (boundary,) * 2 if isinstance(boundary, str) else boundary
+    periodic = [name == "periodic" for name in names]
+    for solid, mask in zip(solids, filled, strict=True):
+        assert (mask | ~solid).all()  # nothing opens
+        fluid = [tuple(cell) for cell in (~solid).nonzero().tolist()]
+        parts = []
+        while fluid:
+            parts.append(reached(solid, periodic, fluid[:1]))
+            fluid = [cell for cell in fluid if cell not in parts[-1]]
+        if is_open:
+            ends = [{x for _, x in part} for part in parts]
+            parts = [part for part, x in zip(parts, ends, strict=True) if 0 in x and shape[1] - 1 in x]
+        else:
+            parts = [max(parts, key=len)]
+        kept = {tuple(cell) for cell in (~mask).nonzero().tolist()}
+        assert kept == set().union(*parts)
+        assert torch.equal(flow.fill_pockets(solid), mask)
+    flow.obstacle = filled
+    flow(0.1 * noise(4, 2, *shape))
+    assert flow.info.solved.all()
+
+
+def test_what_leaves_no_fluid_is_refused():
+    flow = prdp.Flow(PLANE, 0.01, 0.01, boundary=("wall", "open"), inflow=(0.1, 0.0))
+    with pytest.raises(ValueError, match="leaves no way from the open end to the other"):
+        flow.fill_pockets(block(PLANE, (slice(None), 3)))
+    with pytest.raises(ValueError, match="the obstacle fills the grid"):
+        flow.fill_pockets(~block(PLANE))
+    with pytest.raises(TypeError, match="obstacle must be a bool tensor"):
+        flow.fill_pockets(torch.zeros(PLANE))
+    with pytest.raises(ValueError, match=r"the shape of the grid, \[5, 6\], or \(batch\) of them, got \[6, 5\]"):
+        flow.fill_pockets(block((6, 5)))
+    solids = block(PLANE, (0, 1), (1, 0))[None]  # a dead end at the inlet
+    with pytest.raises(ValueError, match=r"make the cells before it solid, as with Flow\.fill_pockets"):
+        flow.obstacle = solids
+        flow(noise(1, 2, *PLANE))
+    flow.obstacle = flow.fill_pockets(solids)
+    flow(0.1 * noise(1, 2, *PLANE))

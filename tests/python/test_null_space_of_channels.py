@@ -138,9 +138,9 @@ def test_other_shapes_are_refused():
     for wrong in (torch.ones(1, 3, N, dtype=F64), torch.ones(1, 2, N + 1, dtype=F64), torch.ones(N, dtype=F64)):
         with pytest.raises(ValueError, match=r"Function: a null space must have shape \(k, \*shape\).*\(k, channels, "):
             prdp.linear_solve(stokes(nullspace=wrong), b, SOLVERS["gmres"])
-    a = operators.Matrix(torch.zeros(N, N, dtype=F64), nullspace=torch.ones(1, 1, N, dtype=F64))
+    a = operators.Matrix(torch.zeros(N, N, dtype=F64), nullspace=torch.ones(1, 1, 1, N, dtype=F64))
     with pytest.raises(
-        ValueError, match=r"Matrix: a null space must have shape \(k, \*shape\).*\[9\], got \[1, 1, 9\]"
+        ValueError, match=r"Matrix: a null space must have shape \(k, \*shape\).*\(batch, k, n\); got \[1, 1, 1, 9\]"
     ):
         prdp.linear_solve(a, b[:, 0], prdp.CG(3))
     mixed = operators.Function(saddle, tensors=(WEIGHT,), nullspace=PRESSURE, left_nullspace="constant")

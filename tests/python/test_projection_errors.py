@@ -33,7 +33,11 @@ BAD = {
     "nu of a shape": ({"nu": torch.ones(2, 1)}, ValueError, "of shape () or (batch or 1,), got [2, 1]"),
     "advection": ({"advection": "weno"}, ValueError, "advection must be 'central' or 'upwind', got 'weno'"),
     "diffusion": ({"diffusion": "none"}, ValueError, "diffusion must be 'implicit' or 'explicit', got 'none'"),
-    "mask of another shape": ({"obstacle": solid((7, 8))}, ValueError, "the shape of the grid, [8, 6], got [7, 8]"),
+    "mask of another shape": (
+        {"obstacle": solid((7, 8))},
+        ValueError,
+        "the shape of the grid, [8, 6], or (batch or 1) of them, got [7, 8]",
+    ),
     "mask of numbers": ({"obstacle": torch.zeros(8, 6)}, TypeError, "obstacle must be a bool tensor"),
     "mask that fills": ({"obstacle": ~solid((8, 6))}, ValueError, "the obstacle fills the grid"),
     "force": ({"force": torch.zeros(3)}, ValueError, "force must have shape (2,) or (batch or 1, 2, 8, 6), got [3]"),

@@ -81,8 +81,8 @@ class NavierStokes final : public Kernel<T> {
       weight(kXUpper)[i] = i + 1 < nx() ? inverse_dx_ : T(0);
       weight(kY)[i] = inverse_dy_;
     }
-    const std::vector<std::vector<double>> constant{
-        std::vector<double>(ny() * nx(), 1.0 / std::sqrt(static_cast<double>(ny() * nx())))};
+    const std::vector<NullVector> constant{
+        {0, std::vector<double>(ny() * nx(), 1.0 / std::sqrt(static_cast<double>(ny() * nx())))}};
     const NullSpace<T> pressure(layout(), 2, 1, constant);
     Base::set_null_spaces(pressure, pressure);
   }

@@ -9,23 +9,29 @@
 
 namespace prdp::kernels {
 
+/// A vector that is zero but for some entries in a row, the first of which is `begin`.
+struct NullVector {
+  int64_t begin = 0;
+  std::vector<double> values{};
+};
+
 /// Vectors that A maps to zero: the same in each of some fields of a sample, or vectors of several fields together.
 template <class T>
 class NullSpace {
  public:
   /// `basis`: orthonormal vectors of `span` fields, contiguous, one after the other. The fields are those from `first`
   /// on.
-  NullSpace(const Layout<T>& layout, int64_t first, int64_t fields, const std::vector<std::vector<double>>& basis,
+  NullSpace(const Layout<T>& layout, int64_t first, int64_t fields, const std::vector<NullVector>& basis,
             int64_t span = 1)
       : layout_(layout), first_(first), fields_(fields), span_(span) {
-    const int64_t points = layout.rows * layout.nx;
     for (const auto& q : basis) {
-      const std::vector<T> v(q.begin(), q.end());
-      basis_.emplace_back(span * layout.plane, T(0));
-      for (int64_t f = 0; f < span; ++f)
-        loops<T>().copy_rows(T(1), v.data() + f * points, layout.nx, basis_.back().data() + f * layout.plane,
-                             layout.row, layout.rows, layout.nx);
-      support_.push_back(support_of(basis_.back()));
+      constexpr int64_t whole = 16;  // registers
+      const auto count = std::ssize(q.values);
+      const int64_t begin = place_of(q.begin) / whole * whole;
+      const int64_t end = (place_of(q.begin + count - 1) + whole) / whole * whole;
+      basis_.push_back({begin, std::vector<T>(std::min(end, span * layout.plane) - begin)});
+      for (int64_t i = 0; i < count; ++i)
+        basis_.back().values[place_of(q.begin + i) - begin] = static_cast<T>(q.values[i]);
     }
   }
   /// Takes off the part of v in the null space, but for parts along one of its vectors that are no larger than
@@ -33,13 +39,11 @@ class NullSpace {
   T project(T* v, T negligible = 0) const {
     double part2 = 0;
     for (int64_t f = first_; f < first_ + fields_; f += span_)
-      for (size_t k = 0; k < basis_.size(); ++k) {
-        const auto [begin, length] = support_[k];
-        const T* q = basis_[k].data() + begin;
+      for (const auto& [begin, q] : basis_) {
         T* field = v + f * layout_.plane + begin;
-        const T along = vectors_.dot(q, field, length);
+        const T along = vectors_.dot(q.data(), field, std::ssize(q));
         if (std::abs(along) <= negligible) continue;
-        vectors_.axpy(-along, q, field, length);
+        vectors_.axpy(-along, q.data(), field, std::ssize(q));
         part2 += static_cast<double>(along) * static_cast<double>(along);
       }
     return static_cast<T>(std::sqrt(part2));
@@ -49,12 +53,14 @@ class NullSpace {
   /// is the same for every field.
   std::vector<std::vector<double>> in_one_field() const {
     std::vector<std::vector<double>> all;
-    for (const auto& q : basis_)
+    const int64_t points = layout_.rows * layout_.nx;
+    for (const auto& [begin, q] : basis_)
       for (int64_t f = 0; f < span_; ++f) {
-        std::vector<T> part(layout_.rows * layout_.nx);
-        loops<T>().copy_rows(T(1), q.data() + f * layout_.plane, layout_.row, part.data(), layout_.nx, layout_.rows,
-                             layout_.nx);
-        std::vector<double> v(part.begin(), part.end());
+        std::vector<double> v(points);
+        for (int64_t i = 0; i < points; ++i) {
+          const int64_t at = place_of(f * points + i) - begin;
+          if (at >= 0 && at < std::ssize(q)) v[i] = static_cast<double>(q[at]);
+        }
         if (span_ == 1 || is_new(all, v)) all.push_back(std::move(v));
       }
     return all;
@@ -62,17 +68,10 @@ class NullSpace {
   int64_t count_in_one_field() const { return span_ == 1 ? std::ssize(basis_) : std::ssize(in_one_field()); }
 
  private:
-  /// From the first entry to the last one that is not zero, in whole registers.
-  struct Support {
-    int64_t begin, length;
-  };
-  static Support support_of(const std::vector<T>& q) {
-    constexpr int64_t whole = 16;
-    const auto is_there = [](T x) { return x != T(0); };
-    const auto end = static_cast<int64_t>(q.rend() - std::find_if(q.rbegin(), q.rend(), is_there));
-    const auto first = static_cast<int64_t>(std::find_if(q.begin(), q.end(), is_there) - q.begin());
-    const int64_t begin = std::min(first, end) / whole * whole;
-    return {begin, std::min((end + whole - 1) / whole * whole, std::ssize(q)) - begin};
+  /// Of entry i of a vector, in padded memory.
+  int64_t place_of(int64_t i) const {
+    const int64_t points = layout_.rows * layout_.nx, in_field = i % points;
+    return i / points * layout_.plane + in_field / layout_.nx * layout_.row + in_field % layout_.nx;
   }
 
   /// Makes v orthonormal to the others; false if it depends on them.
@@ -93,8 +92,12 @@ class NullSpace {
 
   Layout<T> layout_;
   int64_t first_, fields_, span_;
-  std::vector<std::vector<T>> basis_;
-  std::vector<Support> support_;
+  /// From the first entry to the last one that is not zero, in whole registers of padded memory.
+  struct Vector {
+    int64_t begin;
+    std::vector<T> values;
+  };
+  std::vector<Vector> basis_;
   WholeVectors<T> vectors_;
 };
 

@@ -95,6 +95,7 @@ std::vector<int64_t> pivots(std::vector<std::vector<double>> vectors) {
     found.push_back(at);
     for (size_t j = k + 1; j < vectors.size(); ++j) {
       const double share = vectors[j][at] / v[at];
+      if (share == 0.0) continue;
       for (size_t i = 0; i < v.size(); ++i) vectors[j][i] -= share * v[i];
       vectors[j][at] = 0.0;
     }

@@ -141,9 +141,12 @@ void DiffusionOperator::check_kappa(Checks checks) const {
   if (checks == Checks::kShared || !wrong.any().item<bool>()) return;
   const auto index = first_true(wrong);
   const double value = kappa_.masked_select(wrong)[0].item<double>();
-  TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ", value, " in sample ", index[0], " at index ",
-                    as_tuple(at::IntArrayRef(index).slice(per_axis_ ? 1 : 2)),
-                    value == 0.0 ? "; where nothing flows, give 1e-12 times a typical one" : "");
+  TORCH_CHECK_VALUE(
+      false, "Diffusion: kappa must be > 0, got ", value, " in sample ", index[0], " at index ",
+      as_tuple(at::IntArrayRef(index).slice(per_axis_ ? 1 : 2)),
+      value == 0.0
+          ? "; where nothing flows, give 1e-12 times a typical one, with a side or a shift that holds each region"
+          : "");
 }
 
 std::optional<DiffusionOperator::Refused> DiffusionOperator::first_refused(int64_t sample) const {

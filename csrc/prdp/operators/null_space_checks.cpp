@@ -77,13 +77,16 @@ void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Ten
   const auto vectors = q / sizes.masked_fill(sizes.eq(0), 1.0);
   const bool spans_channels = basis.spans_channels(b);
   const double rounding = 200.0 * epsilon_of(b);
+  int64_t worst = 0;  // of the samples
   // The largest entry of a product: 0 where it is rounding or not finite; the sample's status reports the latter.
   const auto largest_of = [&](const at::Tensor& vector) {
     const auto v = basis.is_of_samples(b) ? vector.expand({b.size(0), -1}).reshape_as(b)
                                           : in_each_channel(vector, by_vector(b, spans_channels)).reshape_as(b);
     const auto left = sample_maxima(apply_on_loops(*a_, v, transposed));
     const auto wrong = (left > rounding * size).logical_and(left.isfinite());
-    return left.masked_fill(wrong.logical_not(), 0.0).amax().item<double>();
+    const auto of_samples = left.masked_fill(wrong.logical_not(), 0.0);
+    worst = of_samples.argmax().item<int64_t>();
+    return of_samples.amax().item<double>();
   };
   if (q.size(-2) > 1) {  // all of them by one product
     const auto sum = at::matmul(unlike_numbers(q.size(-2), q.options()), vectors);
@@ -94,8 +97,8 @@ void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Ten
     TORCH_CHECK_VALUE(
         left == 0.0, title_, ": vector ", k, " of ",
         in_language(transposed ? "left_nullspace" : "nullspace", transposed ? "the left ones" : "those"),
-        " is not in the null space of ", transposed ? "Aᵀ" : "A", ": a product has entries of ", left,
-        " where ‖v‖∞ is 1",
+        basis.is_of_samples(b) ? c10::str(" of sample ", worst) : std::string(), " is not in the null space of ",
+        transposed ? "Aᵀ" : "A", ": a product has entries of ", left, " where ‖v‖∞ is 1",
         transposed ? c10::str("; give ", in_language("left_nullspace=", "the left one, too,"), " if A is not symmetric")
                    : std::string(),
         !spans_channels && b.dim() > 2 && b.size(1) > 1

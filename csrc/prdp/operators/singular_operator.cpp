@@ -19,12 +19,15 @@ namespace prdp {
 
 namespace {
 
+/// Whether no two of these rows, (…, k, n), have an entry at the same place.
+bool are_disjoint(const at::Tensor& rows) { return rows.ne(0).sum(-2).le(1).all().item<bool>(); }
+
 /// Orthonormal vectors in double by Gram and Schmidt, twice. `rows`: (k, n), or (batch, k, n), where a vector of zeros
 /// remains.
 at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
   const bool of_samples = rows.dim() == 3;
   std::vector<at::Tensor> done;
-  const bool are_apart = rows.ne(0).sum(-2).le(1).all().item<bool>();  // such as those of the parts of a graph
+  const bool are_apart = are_disjoint(rows);
   for (int64_t k = 0; k < rows.size(-2); ++k) {
     auto q = rows.select(-2, k);
     const auto whole = q.norm(2, -1, /*keepdim=*/true);
@@ -42,6 +45,52 @@ at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
     done.push_back(q / left.masked_fill(remains, 1.0));
   }
   return at::stack(done, -2);
+}
+
+/// The same of disjoint rows, in a few operations however many there are; nothing if one of them is zero, or not
+/// finite, and may not be.
+DisjointVectors disjoint_vectors(const at::Tensor& rows) {
+  const auto vector = rows.ne(0).to(at::kByte).argmax(-2), entry = rows.sum(-2);
+  const auto squares = at::zeros(rows.sizes().slice(0, rows.dim() - 1), rows.options());
+  const auto norms = squares.scatter_add(-1, vector, entry * entry).sqrt();
+  const bool all_are_there = rows.dim() == 3 || norms.gt(0).all().item<bool>();
+  if (!all_are_there || !norms.isfinite().all().item<bool>()) return {};
+  return {vector, entry / norms.masked_fill(norms.eq(0), 1.0).gather(-1, vector)};
+}
+
+/// What was found of the last tensor, as the steps of a flow have the same.
+class LastDisjoint {
+ public:
+  DisjointVectors vectors;
+
+  bool matches(const at::Tensor& t, bool of_samples) const {
+    return !t.is_inference() && tensor_.lock().get() == t.unsafeGetTensorImpl() && version_ == t._version() &&
+           of_samples_ == of_samples;
+  }
+  void store(const at::Tensor& t, bool of_samples, DisjointVectors found) {
+    if (t.is_inference()) return;  // its version is not counted
+    tensor_ = Weak(t.getIntrusivePtr());
+    version_ = t._version();
+    of_samples_ = of_samples;
+    vectors = std::move(found);
+  }
+
+ private:
+  using Weak = c10::weak_intrusive_ptr<at::TensorImpl, at::UndefinedTensorImpl>;
+  Weak tensor_{c10::intrusive_ptr<at::TensorImpl, at::UndefinedTensorImpl>()};
+  int64_t version_ = 0;
+  bool of_samples_ = false;
+};
+
+/// v (batch, fields, n) without its parts along the vectors.
+at::Tensor without_disjoint(const at::Tensor& v, const DisjointVectors& of, int64_t count) {
+  const auto parts = v.flatten(0, -2).to(at::kDouble);
+  const auto of_fields = [&](const at::Tensor& t) {
+    return t.dim() == 1 ? t.expand_as(parts) : t.repeat_interleave(parts.size(0) / t.size(0), 0);
+  };
+  const auto vector = of_fields(of.vector), entry = of_fields(of.entry);
+  const auto along = at::zeros({parts.size(0), count}, parts.options()).scatter_add(-1, vector, parts * entry);
+  return (parts - along.gather(-1, vector) * entry).to(v.scalar_type()).view_as(v);
 }
 
 /// The vectors of a basis as the rows of a matrix, (k, n) or (batch, k, n).
@@ -63,8 +112,8 @@ OperatorSpec with_null_space(OperatorSpec a, const at::Tensor& right, std::optio
 SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec)
     : a_(std::move(a)),
       spec_(spec),
-      right_{spec.tensors[spec.tensors.size() - 2].detach(), {}},
-      left_{spec.tensors.back().detach(), {}},
+      right_{spec.tensors[spec.tensors.size() - 2].detach(), spec.tensors[spec.tensors.size() - 2]},
+      left_{spec.tensors.back().detach(), spec.tensors.back()},
       needs_derivative_(any_needs_derivative(at::TensorList(spec.tensors).slice(spec.tensors.size() - 2))),
       title_(operator_kind(spec.kind).title) {
   // Whether they are of each sample is known beside a vector, where check_vector() looks again.
@@ -105,9 +154,26 @@ at::Tensor SingularOperator::orthonormal(const Basis& basis, const at::Tensor& v
   return basis.orthonormal.to(v.scalar_type());
 }
 
+const DisjointVectors& SingularOperator::disjoint(const Basis& basis, const at::Tensor& v) const {
+  constexpr int64_t many = 4;
+  if (basis.disjoint) return *basis.disjoint;
+  basis.disjoint.emplace();
+  const bool of_samples = basis.is_of_samples(v);
+  if (basis.is_constant() || at::isTensorSubclassLike(basis.given) || basis.given.size(of_samples) < many)
+    return *basis.disjoint;
+  static thread_local LastDisjoint last;
+  if (last.matches(basis.source, of_samples)) return *(basis.disjoint = last.vectors);
+  const auto rows = rows_of(basis.given, of_samples).to(at::kDouble);
+  if (are_disjoint(rows)) basis.disjoint = disjoint_vectors(rows);
+  last.store(basis.source, of_samples, *basis.disjoint);
+  return *basis.disjoint;
+}
+
 at::Tensor SingularOperator::without(const Basis& basis, const at::Tensor& v) const {
   const auto parts = by_vector(v, basis.spans_channels(v) || basis.is_of_samples(v));
   if (basis.is_constant()) return (parts - mean_in_order(parts, {-1})).reshape_as(v);
+  if (const auto& vectors = disjoint(basis, v.detach()))
+    return without_disjoint(parts, vectors, basis.given.size(basis.is_of_samples(v))).reshape_as(v);
   const auto q = orthonormal(basis, v.detach());
   return without_parts(parts, q, q).reshape_as(v);
 }
@@ -197,23 +263,43 @@ std::optional<gpu::OperatorView> SingularOperator::gpu_view(const at::Tensor& b,
 
 namespace {
 
-/// An orthonormal basis (k, n) or (batch or 1, k, n) as numbers of the host.
+/// An orthonormal basis as numbers of the host.
 class BasisOfSamples {
  public:
+  /// (k, n), or (batch or 1, k, n).
   explicit BasisOfSamples(const at::Tensor& q)
-      : q_((q.dim() == 2 ? q.unsqueeze(0) : q).to(at::kCPU, at::kDouble).contiguous()) {}
+      : count_(q.size(-2)), entries_((q.dim() == 2 ? q.unsqueeze(0) : q).to(at::kCPU, at::kDouble).contiguous()) {}
+  BasisOfSamples(const DisjointVectors& q, int64_t count)
+      : count_(count),
+        entries_(at::atleast_2d(q.entry).to(at::kCPU).contiguous()),
+        vector_(at::atleast_2d(q.vector).to(at::kCPU).contiguous()) {}
   /// The vectors of a sample, without those of zeros.
-  std::vector<std::vector<double>> of(int64_t s) const {
-    const int64_t n = q_.size(2);
-    const double* const first = q_.const_data_ptr<double>() + (q_.size(0) == 1 ? 0 : s) * q_.size(1) * n;
-    std::vector<std::vector<double>> rows;
-    for (const double* row = first; row != first + q_.size(1) * n; row += n)
-      if (std::any_of(row, row + n, [](double x) { return x != 0; })) rows.emplace_back(row, row + n);
-    return rows;
+  std::vector<kernels::NullVector> of(int64_t s) const {
+    const int64_t sample = entries_.size(0) == 1 ? 0 : s, n = entries_.size(-1);
+    std::vector<kernels::NullVector> found(count_);
+    if (vector_.defined()) {
+      const double* entry = entries_.const_data_ptr<double>() + sample * n;
+      const int64_t* vector = vector_.const_data_ptr<int64_t>() + sample * n;
+      for (int64_t i = 0; i < n; ++i) add(found[vector[i]], i, entry[i]);
+    } else {
+      const double* entry = entries_.const_data_ptr<double>() + sample * count_ * n;
+      for (auto& v : found)
+        for (int64_t i = 0; i < n; ++i) add(v, i, *entry++);
+    }
+    std::erase_if(found, [](const kernels::NullVector& v) { return v.values.empty(); });
+    return found;
   }
 
  private:
-  at::Tensor q_;
+  static void add(kernels::NullVector& v, int64_t i, double entry) {
+    if (entry == 0.0) return;
+    if (v.values.empty()) v.begin = i;
+    v.values.resize(i - v.begin);  // zeros between
+    v.values.push_back(entry);
+  }
+
+  int64_t count_;
+  at::Tensor entries_, vector_;
 };
 
 }  // namespace
@@ -222,7 +308,9 @@ std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tens
   const auto regular = a_->kernels(b, transposed);
   if (!regular) return nullptr;
   const auto vectors_of = [&](const Basis& basis) {
-    return std::make_shared<const BasisOfSamples>(orthonormal(basis, b.detach()));
+    const auto& vectors = disjoint(basis, b.detach());
+    return vectors ? std::make_shared<const BasisOfSamples>(vectors, basis.given.size(basis.is_of_samples(b)))
+                   : std::make_shared<const BasisOfSamples>(orthonormal(basis, b.detach()));
   };
   const auto right = vectors_of(transposed ? left_ : right_), left = vectors_of(transposed ? right_ : left_);
   const bool spans_channels = right_.spans_channels(b), of_samples = right_.is_of_samples(b);

@@ -19,6 +19,13 @@ at::Tensor follow_null_space(const at::Tensor& u, const at::Tensor& basis);
 /// v with the unknowns that a vector of a basis has as its last axis: those of a channel, or of all.
 at::Tensor by_vector(const at::Tensor& v, bool spans_channels);
 
+/// Orthonormal vectors of which no two have an entry at the same place, (n,) or (batch, n): the number of the vector
+/// that has one there, and the entry, in double. Undefined where there are no such vectors.
+struct DisjointVectors {
+  at::Tensor vector, entry;
+  explicit operator bool() const { return vector.defined(); }
+};
+
 /// A singular operator together with its null spaces, which its user names: vectors that A maps to zero (right), and
 /// such that Aᵀ maps to zero (left). Right-hand sides and cotangents are projected onto what A, or Aᵀ, can reach, and
 /// solutions onto those of least norm. A right-hand side with a part outside, beyond rtol, is INCONSISTENT. Its kind is
@@ -63,8 +70,10 @@ class SingularOperator final : public Operator {
 
  private:
   struct Basis {
-    at::Tensor given;
-    mutable at::Tensor orthonormal;  // in double, once it has been asked for
+    at::Tensor given;   // without a derivative
+    at::Tensor source;  // what the spec has
+    mutable at::Tensor orthonormal{};           // in double, once it has been asked for
+    mutable std::optional<DisjointVectors> disjoint{};  // the same
 
     bool is_constant() const { return given.sym_numel() == 0; }
     /// Whether each sample of v has vectors of its own.
@@ -76,6 +85,8 @@ class SingularOperator final : public Operator {
   };
 
   void check_counts(const c10::SymInt& right, const c10::SymInt& left) const;
+  /// Many vectors of which no two have an entry at the same place, such as those of the parts of a graph.
+  const DisjointVectors& disjoint(const Basis& basis, const at::Tensor& v) const;
   /// An orthonormal basis (k, n), or (batch, k, n), in the dtype of v, with n the unknowns of a channel, or of all.
   at::Tensor orthonormal(const Basis& basis, const at::Tensor& v) const;
   at::Tensor without(const Basis& basis, const at::Tensor& v) const;

@@ -133,7 +133,7 @@ struct FlowViscosityBars {
   int64_t sample;  // entries of a pattern between two samples; 0: they share it
   // Of the share of the pressure that is taken off beyond a largest ν. Absent: the whole one is.
   FlowField<const T> change, balanced, potential, potential_bar;
-  double largest_nu;
+  FlowNumber<double> largest_nu;
 
   double at(const FlowReverse<T>& reverse, int s, int c, const FlowPlace& p) const {
     const auto& terms = reverse.terms;
@@ -147,7 +147,7 @@ struct FlowViscosityBars {
     if (!diffused) return sum;
     const double bar = static_cast<double>(lambda.at(s, c, p)), nu = static_cast<double>(terms.nu.value(s));
     sum -= terms.dt * bar * of_pattern(grid, s, c, p);
-    if (!balanced || nu <= largest_nu) return sum;
+    if (!balanced || nu <= largest_nu.value(s)) return sum;
     double of_share = bar * static_cast<double>(balanced.at(s, c, p) - change.at(s, c, p));
     if (c == 0 && potential_bar)
       of_share += static_cast<double>(potential_bar.at(s, 0, p)) * static_cast<double>(potential.at(s, 0, p));

@@ -37,10 +37,11 @@ struct FlowClosedParts {
 template <class T>
 struct FlowShare {
   FlowNumber<T> nu;
-  double largest_nu;
+  FlowNumber<double> largest_nu;
   T value(int s) const {
     const T here = nu.value(s);
-    return static_cast<double>(here) > largest_nu ? static_cast<T>(largest_nu) / here : T(1);
+    const double largest = largest_nu.value(s);
+    return static_cast<double>(here) > largest ? static_cast<T>(largest) / here : T(1);
   }
 };
 

@@ -14,7 +14,7 @@ Projected balance(const FlowEquation& equation, const at::Tensor& change, const 
                   CombinedInfo& info);
 
 /// The largest ν for which the whole of this pressure is taken off.
-double largest_viscosity(const FlowEquation& equation);
+LargestViscosity largest_viscosity(const FlowEquation& equation, const at::Tensor& like);
 
 /// The cotangents of the change and of ν from those of the result. ν's needs the change; both are undefined without.
 struct BalanceVjp {

@@ -2,7 +2,10 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include <algorithm>
 #include <deque>
+
+#include "prdp/error_text.h"
 
 namespace prdp {
 
@@ -50,23 +53,34 @@ Parts find_parts(const FlowBox& box, const at::Tensor& fluid) {
   return parts;
 }
 
-/// The parts without an open end, (parts, *shape). `whose` obstacle it is, for errors.
-at::Tensor find_closed_parts(const FlowBox& box, const at::Tensor& fluid, const std::string& whose) {
+/// Which parts have cells at the low end of the open axis, and at the high end; none without one.
+struct OpenEnds {
+  std::vector<bool> inlet, outlet;
+};
+OpenEnds open_ends(const FlowBox& box, const Parts& parts) {
   const int64_t open = box.open_axis();
-  const auto parts = find_parts(box, fluid);
-  std::vector<bool> inlet(parts.count), outlet(parts.count);
+  OpenEnds ends{std::vector<bool>(parts.count), std::vector<bool>(parts.count)};
   const auto cells = static_cast<int64_t>(parts.of_cell.size());
   for (int64_t cell = 0; cell < cells && open >= 0; ++cell) {
     if (parts.of_cell[cell] < 0) continue;
-    if (position(box, cell, open) == 0) inlet[parts.of_cell[cell]] = true;
-    if (position(box, cell, open) == box.shape()[open] - 1) outlet[parts.of_cell[cell]] = true;
+    if (position(box, cell, open) == 0) ends.inlet[parts.of_cell[cell]] = true;
+    if (position(box, cell, open) == box.shape()[open] - 1) ends.outlet[parts.of_cell[cell]] = true;
   }
+  return ends;
+}
+
+/// The parts without an open end, (parts, *shape). `whose` obstacle it is, for errors.
+at::Tensor find_closed_parts(const FlowBox& box, const at::Tensor& fluid, const std::string& whose) {
+  const auto parts = find_parts(box, fluid);
+  const auto [inlet, outlet] = open_ends(box, parts);
   const auto numbers = at::tensor(parts.of_cell, at::kLong).reshape(box.shape());
   std::vector<at::Tensor> closed{at::empty(box.shape(), at::kDouble).unsqueeze(0).narrow(0, 0, 0)};
   for (int64_t p = 0; p < parts.count; ++p) {
-    TORCH_CHECK_VALUE(!inlet[p] || outlet[p], "Flow: the obstacle", whose,
-                      " keeps fluid that comes in at the open end from going out at the other; make "
-                      "the cells before it solid, or open a way");
+    TORCH_CHECK_VALUE(
+        !inlet[p] || outlet[p], "Flow: the obstacle", whose,
+        " keeps fluid that comes in at the open end from going out at the other; make the cells before it "
+        "solid, as with ",
+        in_language("Flow.fill_pockets", "fill_pockets()"), ", or open a way");
     const auto cells_of_part = numbers.eq(p);
     // The pressure of a cell without a free face is known.
     if (!outlet[p] && cells_of_part.sum().item<int64_t>() > 1)
@@ -169,6 +183,12 @@ at::Tensor signs_beyond_high_wall(const FlowBox& box, int64_t axis) {
   return signs.reshape(shape);
 }
 
+/// (samples, cells) of closed parts (samples, parts, *shape).
+at::Tensor number_of_part(const at::Tensor& parts) {
+  const auto in_part = parts.flatten(2).ne(0);
+  return at::where(in_part.any(1), in_part.to(at::kByte).argmax(1) + 1, 0);
+}
+
 bool all_ones(const at::Tensor& mask) { return mask.eq(1).all().item<bool>(); }
 
 /// Of the box with these cells of fluid, (*shape): the masks are all there.
@@ -218,6 +238,32 @@ FlowFields of_samples(const std::vector<FlowFields>& boxes) {
 
 }  // namespace
 
+at::Tensor fill_pockets(const FlowBox& box, const at::Tensor& obstacle) {
+  TORCH_CHECK_TYPE(obstacle.scalar_type() == at::kBool,
+                   "Flow: obstacle must be a bool tensor, true in solid cells, got ", obstacle.scalar_type());
+  const bool is_of_samples = obstacle.dim() == box.dim() + 1;
+  TORCH_CHECK_VALUE((is_of_samples ? obstacle.sizes().slice(1) : obstacle.sizes()) == at::IntArrayRef(box.shape()),
+                    "Flow: obstacle must have the shape of the grid, ", at::IntArrayRef(box.shape()),
+                    ", or (batch) of them, got ", obstacle.sizes());
+  auto filled = obstacle.to(at::kCPU, /*non_blocking=*/false, /*copy=*/true).contiguous();
+  for (auto& solid : (is_of_samples ? filled : filled.unsqueeze(0)).unbind()) {
+    const auto parts = find_parts(box, solid.logical_not());
+    TORCH_CHECK_VALUE(parts.count > 0, "Flow: the obstacle fills the grid; at least one cell must be fluid");
+    std::vector<int64_t> cells(parts.count);
+    for (const int64_t part : parts.of_cell)
+      if (part >= 0) ++cells[part];
+    const int64_t largest = std::max_element(cells.begin(), cells.end()) - cells.begin();
+    const auto [inlet, outlet] = open_ends(box, parts);
+    const auto flows = [&](int64_t part) {
+      return part >= 0 && (box.open_axis() < 0 ? part == largest : inlet[part] && outlet[part]);
+    };
+    auto* values = solid.mutable_data_ptr<bool>();
+    for (size_t i = 0; i < parts.of_cell.size(); ++i) values[i] = !flows(parts.of_cell[i]);
+    TORCH_CHECK_VALUE(!solid.all().item<bool>(), "Flow: the obstacle leaves no way from the open end to the other");
+  }
+  return filled.to(obstacle.device());
+}
+
 FlowFields make_flow_fields(const FlowBox& box) {
   const at::NoGradGuard no_grad;
   const bool has_obstacle = box.obstacle().defined();
@@ -234,7 +280,10 @@ FlowFields make_flow_fields(const FlowBox& box) {
   if (!has_obstacle) fields.friction = at::Tensor();
   if (!has_obstacle && box.open_axis() < 0) fields.closed_parts = at::empty({0}, at::kDouble);
   else if (fields.closed_parts.numel() == 0) fields.closed_parts = at::Tensor();
+  else fields.part_of_cell = number_of_part(fields.closed_parts);
+  const auto is_free = fields.free.flatten(1).eq(1).all(1);
   if (all_ones(fields.free)) fields.diffusion.resize(1);  // periodic, no obstacle: all components are alike
+  else if (is_free.any().item<bool>()) fields.is_free = is_free;
   for (auto* mask : {&fields.cells, &fields.free})
     if (all_ones(*mask)) *mask = at::Tensor();
   return fields;

@@ -7,4 +7,9 @@ namespace prdp {
 /// comes in from going out.
 FlowFields make_flow_fields(const FlowBox& box);
 
+/// `obstacle`, bool (*shape) or (batch, *shape), and what nothing flows through: all fluid but the largest connected
+/// part or, in a box with an open axis, the parts that join its two ends. `box` has no obstacle. Raises ValueError if
+/// no fluid is left.
+at::Tensor fill_pockets(const FlowBox& box, const at::Tensor& obstacle);
+
 }  // namespace prdp

@@ -37,6 +37,13 @@ struct FlowFields {
   /// (…, parts, *shape): 1 in the cells of each closed part of the fluid, where the pressure has no level; zeros where
   /// a sample has fewer. Empty for one part of all cells, undefined if there are none.
   at::Tensor closed_parts;
+  at::Tensor null_vectors;  // the same as a singular operator takes them
+  at::Tensor part_of_cell;  // (…, cells): the closed part that a cell is in, from 1 on, or 0; undefined if none is
+  at::Tensor is_free;  // (samples,) bool, where all faces of some of them are free, but not of all; else undefined
+  /// The largest ν dt for which an incremental step takes the whole pressure of the explicit part off (balance.h): of
+  /// all samples, or where they differ, of each, (samples,) in float64.
+  double largest_diffusion = 0;
+  at::Tensor largest_diffusions;
   std::shared_ptr<gpu::KeptHierarchy> coarse_grids;  // of the pressure, on a GPU
 };
 

@@ -64,6 +64,10 @@ gpu::FlowNumber<T> number_of(const at::Tensor& t) {
   return {data_of<const T>(t), t.defined() && t.numel() > 1 ? t.stride(0) : 0, T(0)};
 }
 
+inline gpu::FlowNumber<double> number_of(const LargestViscosity& limit) {
+  return limit.of_each.defined() ? number_of<double>(limit.of_each) : gpu::FlowNumber<double>{nullptr, 0, limit.of_all};
+}
+
 template <class T>
 gpu::FlowTerms<T> terms_of(const FlowEquation& e, const at::Tensor& padded) {
   const auto& fields = e.box->fields(padded.options());

@@ -33,7 +33,7 @@ gpu::FlowClosedParts<T> parts_of(const FlowBox& box, const at::Tensor& like) {
 
 template <class T>
 gpu::FlowShare<T> share_of(const UncorrectedVelocity& of) {
-  return {number_of<T>(of.share_by_nu), of.largest_nu};
+  return {number_of<T>(of.share_by_nu), number_of(of.largest_nu)};
 }
 
 const at::Tensor& velocity_like(const UncorrectedVelocity& of) { return of.base.defined() ? of.base : of.added[0]; }

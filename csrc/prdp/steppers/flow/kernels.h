@@ -7,6 +7,16 @@
 
 /// The pieces of a step, one launch each, in place of some hundred tensor operations on a GPU. Where there is no
 /// kernel, each returns nothing, and tensor operations take its place.
+namespace prdp {
+
+/// A largest ν: of all samples, or where they differ, of each, (samples,) in float64.
+struct LargestViscosity {
+  double of_all = 0;
+  at::Tensor of_each = {};
+};
+
+}  // namespace prdp
+
 namespace prdp::flow_kernels {
 
 /// Whether kernels may compute a step and its gradient: for plain tensors on a device that has a runtime, where
@@ -31,7 +41,7 @@ struct UncorrectedVelocity {
   at::Tensor refused = {};      // samples whose status is not 0 are zero; undefined: none
   at::Tensor status_of_solve = {};  // of a correction that is to be zero where the solve had no finite right-hand side
   at::Tensor share_by_nu = {};  // ν, where less than the whole pressure is taken off beyond a largest one
-  double largest_nu = 0;
+  LargestViscosity largest_nu = {};
 };
 
 /// factor · div u in the cells whose pressure is unknown, (batch, 1, *shape). For a solve: without its means.
@@ -62,7 +72,7 @@ struct ImplicitPart {
   at::Tensor change = {}, balanced = {}, potential = {};
   FlowParts diffused = {}, lambda = {};
   at::Tensor potential_bar = {};
-  double largest_nu = 0;  // for which the whole pressure is taken off
+  LargestViscosity largest_nu = {};  // for which the whole pressure is taken off
 };
 
 /// The cotangents of u and of what the equation is made of, in the order of its tensors, from those of the velocity and

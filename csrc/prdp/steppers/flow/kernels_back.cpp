@@ -74,7 +74,7 @@ gpu::FlowViscosityBars<T> viscosity_bars_of(const FlowBox& box, const ImplicitPa
                                .balanced = field_of<const T>(part.potential.defined() ? part.balanced : at::Tensor()),
                                .potential = field_of<const T>(part.potential),
                                .potential_bar = field_of<const T>(part.potential_bar),
-                               .largest_nu = part.largest_nu};
+                               .largest_nu = number_of(part.largest_nu)};
   if (part.diffused.empty()) return of;
   const auto& patterns = box.fields(part.change.options()).diffusion;
   of.sample = step_of_samples(patterns[0]);

@@ -21,9 +21,7 @@ namespace {
 OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u) {
   const auto& fields = box.fields(u.options());
   auto a = stencil_of(box, fields.pressure);
-  const auto& parts = fields.closed_parts;
-  if (!parts.defined()) return a;
-  return with_null_space(std::move(a), parts.size(0) > 1 ? parts.unsqueeze(2) : parts.squeeze(0));
+  return fields.null_vectors.defined() ? with_null_space(std::move(a), fields.null_vectors) : a;
 }
 
 /// All solves for the pressure share the coarse grids, and have right-hand sides without_means().
@@ -33,12 +31,24 @@ SolveOptions for_pressure(const FlowBox& box, const at::Tensor& b, SolveOptions 
   return options;
 }
 
+/// Takes off the mean of each part that `part_of_cell` numbers, in a few operations however many there are.
+at::Tensor without_means_of_many(const at::Tensor& t, const at::Tensor& part_of_cell, int64_t count) {
+  const auto values = t.flatten(1).to(at::kDouble);
+  const auto part = part_of_cell.expand_as(values);
+  const auto zeros = at::zeros({values.size(0), count + 1}, values.options());
+  const auto sums = zeros.scatter_add(1, part, values), cells = zeros.scatter_add(1, part, at::ones_like(values));
+  const auto means = at::cat({zeros.narrow(1, 0, 1), (sums / cells.clamp_min(1)).narrow(1, 1, count)}, 1);
+  return (values - means.gather(1, part)).to(t.scalar_type()).view_as(t);
+}
+
 /// Takes off the mean of each closed part of the fluid: differences of pressures have none, but for rounding.
 at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
   const auto& parts = box.fields(t.options()).closed_parts;
   if (!parts.defined()) return t;
   const auto flat = t.flatten(2);
   if (parts.numel() == 0) return (flat - mean_in_order(flat, {-1})).view_as(t);
+  constexpr int64_t many = 4;
+  if (parts.size(1) >= many) return without_means_of_many(t, box.fields(t.options()).part_of_cell, parts.size(1));
   const auto of_parts = parts.flatten(2);
   const auto cells = of_parts.sum(2, /*keepdim=*/true).clamp_min(1);
   return without_parts(flat, of_parts / cells, of_parts).view_as(t);

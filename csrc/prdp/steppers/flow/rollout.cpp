@@ -27,9 +27,13 @@ SolveResult one_step(const FlowEquation& equation, const at::Tensor& u, FlowOutp
   return unrolled_step(equation, u, options, output);
 }
 
-/// Whether the implicit diffusion takes the forces with their pressure, and commutes with the projection after it.
+/// Whether the implicit diffusion takes the forces with their pressure, and commutes with the projection after it, in
+/// some samples at least: where all faces are free. An incremental step takes the pressure off before, unless they are
+/// in all samples.
 bool is_diffused_with_pressure(const FlowEquation& e) {
-  return e.is_diffused_implicitly() && !e.box->fields(e.nu.options()).free.defined();
+  const auto& fields = e.box->fields(e.nu.options());
+  const bool in_some = fields.is_free.defined() && e.pressure == FlowPressure::kPlain;
+  return e.is_diffused_implicitly() && (!fields.free.defined() || in_some);
 }
 
 SolveResult unrolled_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
@@ -64,7 +68,10 @@ SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tenso
       })[0];
     });
   }
-  found.u = at::cat({found.u.narrow(1, 0, d), make_operator(diffusion)->apply(p)}, 1);
+  auto whole = make_operator(diffusion)->apply(p);
+  if (const auto& is_free = equation.box->fields(u.options()).is_free; is_free.defined())
+    whole = at::where(per_sample(is_free, p), whole, p);
+  found.u = at::cat({found.u.narrow(1, 0, d), whole}, 1);
   return found;
 }
 

@@ -71,7 +71,7 @@ class ImplicitReverse {
              .potential = balanced.potential,
              .diffused = diffuse(e_, operators_, balanced.u, options_, not_reported),
              .potential_bar = potential_bar_,
-             .largest_nu = largest_viscosity(e_)};
+             .largest_nu = largest_viscosity(e_, change)};
   }
   bool has_run_forward() const { return part_.change.defined(); }
 
