@@ -145,13 +145,15 @@ void judge_numerical_singularity(Space& space, const Method& method, typename Sp
 template <class Method>
 inline constexpr bool kMayGrow = kMayExhaust<Method> || (kHasRecursiveResidual<Method> && !kDescendsEnergy<Method>);
 
-/// Which samples are far from solved, and have a u so large that A u rounds by much beside b: it has grown.
+/// Which samples are far from solved, and have a u so large that A u rounds by much beside b: it has grown. In float32
+/// any u near a null space does, and may be the best that there is.
 template <class Space, class Method>
 auto have_grown(Space& space, const Method& method, const typename Space::States& states) {
+  auto grown = space.map(states, [](const SampleState&) { return false; });
+  if (space.epsilon() > 1e-10) return grown;
   const auto floors = rounding_floors(space, method);
   // All but GMRES may be on their way, in a system as badly conditioned: they are given a hundred times as much.
-  const double bound = std::min(0.25, largest_floor(space) * (kMayExhaust<Method> ? 1.0 : 100.0));
-  auto grown = space.map(states, [](const SampleState&) { return false; });
+  const double bound = largest_floor(space) * (kMayExhaust<Method> ? 1.0 : 100.0);
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
     grown[i] = s.floor2 == 0.0 && s.residual2 > 1e-4 * s.b2 && floors[i] > bound * std::sqrt(s.b2);
