@@ -62,9 +62,9 @@ class Flow(HoldsTensors, Stepper):
         backward and the other options: as in `Stepper`, but `start` must be "zero".
 
     All but `shape` may be set at any time, `pressure` by the name `pressure_form`. A tensor that is set later as `nu`,
-    `force`, `inflow` or `wall_velocity`, such as the output of a network, and obstacles of samples are used in the
-    steps that follow but not saved: copies and `state_dict` keep the earlier value. Parameters, buffers and an
-    obstacle of all samples are saved; plain numbers go into copies, not into `state_dict`.
+    `force`, `inflow` or `wall_velocity`, such as the output of a network, or as obstacles of samples, is used in the
+    steps that follow but not saved: copies and `state_dict` keep the earlier value. Parameters, buffers, an obstacle
+    of all samples and what a flow is made of are saved; plain numbers go into copies, not into `state_dict`.
 
     `info` combines the solves of a step: it has the sum of their iterations, the worst status and the largest residual.
     Each step stores one state for the backward pass, and computes the rest again.
@@ -138,7 +138,7 @@ class Flow(HoldsTensors, Stepper):
             elif name in TENSORS:
                 self._hold(name, _checked(name, value))
             elif name == "obstacle" and (value is None or isinstance(value, Tensor)):
-                of_samples = isinstance(value, Tensor) and value.dim() > len(self.shape)
+                of_samples = isinstance(value, Tensor) and value.dim() > len(self.shape) and len(value) != 1
                 (self._set if of_samples else self._hold)(name, value)
             elif name == "pressure":
                 raise AttributeError("Flow: pressure is a method; the form of the argument is set by pressure_form")

@@ -3,6 +3,14 @@
 import math
 
 import torch
+from fibers import Fibers
+
+
+def by_other_ways(outcome):
+    """What outcome(**options) gives in the graph of second derivatives, with unrolled solves, and by kernels."""
+    others = [outcome(graph=True), outcome(backward="unrolled")]
+    with Fibers():
+        return [*others, outcome()]
 
 
 def positions(shape, channel, length=1.0, dtype=torch.float64):

@@ -1,10 +1,12 @@
 """`Flow` with a nu for each sample, (batch,). Each sample has the result that it has alone."""
 
 import contextlib
+import functools
 
 import pytest
 import torch
 from fibers import Fibers
+from flows import by_other_ways
 from test_gpu_flow import CASES, F32, F64, flow, noise
 
 import prdp_torch as prdp
@@ -72,10 +74,7 @@ def test_it_is_the_flow_of_its_number(name):
 def test_all_ways_agree(name):
     """Loops, kernels, the graph of second derivatives, and unrolled solves."""
     expected = outcome(name, ALL)
-    others = [outcome(name, ALL, graph=True), outcome(name, ALL, backward="unrolled")]
-    with Fibers():
-        others.append(outcome(name, ALL))
-    for other in others:
+    for other in by_other_ways(functools.partial(outcome, name, ALL)):
         for mine, its in zip(other, expected, strict=True):
             torch.testing.assert_close(mine, its, rtol=1e-6, atol=1e-8)
 

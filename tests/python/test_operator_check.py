@@ -269,3 +269,30 @@ def test_a_bad_condition_is_no_null_space(n):
     for dtype in (torch.float32, torch.float64):
         a = operators.Stencil(rows.to(dtype), [(0,), (-1,), (1,)])
         assert prdp.check_operator(a, torch.zeros(1, 1, n, dtype=dtype))
+
+
+class TooLargeAtZeros(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, v, t):
+        ctx.save_for_backward(v, t)
+        return v + t * v
+
+    @staticmethod
+    def backward(ctx, g):
+        v, t = ctx.saved_tensors
+        return g * (1 + t), g * v * torch.where(t == 0, 100.0, 1.0)
+
+
+def test_entries_of_zero_are_looked_at_and_still_water_is_right():
+    example = torch.zeros(1, 20, dtype=torch.float64)
+    t = torch.zeros(1, 20, dtype=torch.float64)
+    t[0, 0] = 1
+    wrong = operators.Function(TooLargeAtZeros.apply, tensors=(t.requires_grad_(),), symmetric=True)
+    with pytest.raises(ValueError, match=r"the gradient for tensor 0 of shape \(1, 20\) is wrong"):
+        prdp.check_operator(wrong, example)
+
+    def upwind(v, c):
+        return v + c.clamp(min=0) * (v - v.roll(1, 1)) + c.clamp(max=0) * (v.roll(-1, 1) - v)
+
+    still = torch.zeros(1, 20, dtype=torch.float64, requires_grad=True)
+    assert prdp.check_operator(operators.Function(upwind, tensors=(still,)), example)

@@ -8,6 +8,7 @@ from helpers import statuses
 import prdp_torch as prdp
 from prdp_torch import operators
 
+F64 = torch.float64
 OFFSETS = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
 METHODS = {
     "cg": lambda k, rtol: prdp.CG(k, rtol),
@@ -180,3 +181,44 @@ def test_a_constraint_given_twice_with_two_values_is_not_solved():
         truth = torch.linalg.pinv(a, rtol=1e-10) @ b[0]
         solved += bool(info.solved) and bool((u - truth).norm() > truth.norm())
     assert solved == 0
+
+
+def with_penalty(penalty, low, high, n=200):
+    a = 2 * torch.eye(n, dtype=F64) + low * torch.diag(torch.ones(n - 1, dtype=F64), -1)
+    a += high * torch.diag(torch.ones(n - 1, dtype=F64), 1)
+    a[0, 0] += penalty
+    a[-1, -1] += penalty
+    return a
+
+
+@pytest.mark.parametrize("penalty", [1e4, 1e12, 1e14])
+@pytest.mark.parametrize(
+    "solver, low, high",
+    [(prdp.MINRES(30, 1e-8, preconditioner="diagonal"), -1, -1),
+     (prdp.BiCGStab(30, 1e-8, preconditioner="diagonal"), -1.05, -0.95)],
+    ids=["minres", "bicgstab"],
+)  # fmt: skip
+def test_a_u_beside_large_rows_has_not_grown(solver, low, high, penalty):
+    b = torch.zeros(1, 200, dtype=F64)
+    b[0, 66] = 1
+    u, info = prdp.linear_solve(with_penalty(penalty, low, high), b, solver)
+    assert info.status.item() == prdp.SolveStatus.MAX_ITER and info.residual.item() < 0.3 and u.norm() > 1
+
+
+def test_gmres_that_stagnates_beside_a_large_row_keeps_its_u():
+    shift = torch.eye(20, dtype=F64).roll(1, 0)
+    a = torch.block_diag(torch.tensor([[1e12]], dtype=F64), torch.eye(10, dtype=F64), shift)
+    b = torch.cat([torch.zeros(1), torch.ones(10), torch.tensor([0.1]), torch.zeros(19)]).to(F64)[None]
+    u, info = prdp.linear_solve(a, b, prdp.GMRES(500, 1e-10, restart=5), on_failure="return")
+    assert info.status.item() == prdp.SolveStatus.STAGNATED and info.residual.item() < 0.1
+    torch.testing.assert_close(u[0, 1:11], torch.ones(10, dtype=F64), rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize("k", [40, 60, 150])
+def test_a_mean_of_b_is_told_whether_u_has_grown_or_not(k):
+    n = 40
+    a = torch.diag(torch.tensor([1.0, *[2.0] * (n - 2), 1.0])).to(F64)
+    a -= torch.diag(torch.ones(n - 1, dtype=F64), 1) + torch.diag(torch.ones(n - 1, dtype=F64), -1)
+    b = torch.randn(1, n, dtype=F64, generator=torch.Generator().manual_seed(0))
+    _, info = prdp.linear_solve(a, b, prdp.BiCGStab(k, 1e-8), on_failure="return")
+    assert info.status.item() == prdp.SolveStatus.INCONSISTENT

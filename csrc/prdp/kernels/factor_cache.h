@@ -65,6 +65,7 @@ void clear();
 /// How many calls of find_or_make() had to make it.
 int64_t count_made();
 void count_one();
+/// 1 GiB.
 int64_t limit();
 int64_t bytes_kept();
 

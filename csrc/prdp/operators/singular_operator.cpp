@@ -64,8 +64,8 @@ class LastDisjoint {
   DisjointVectors vectors;
 
   bool matches(const at::Tensor& t, bool of_samples) const {
-    return !t.is_inference() && tensor_.lock().get() == t.unsafeGetTensorImpl() && version_ == t._version() &&
-           of_samples_ == of_samples;
+    return !t.is_inference() && (!vectors || vectors.entry.device() == t.device()) &&
+           tensor_.lock().get() == t.unsafeGetTensorImpl() && version_ == t._version() && of_samples_ == of_samples;
   }
   void store(const at::Tensor& t, bool of_samples, DisjointVectors found) {
     if (t.is_inference()) return;  // its version is not counted

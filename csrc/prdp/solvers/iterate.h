@@ -145,19 +145,27 @@ void judge_numerical_singularity(Space& space, const Method& method, typename Sp
 template <class Method>
 inline constexpr bool kMayGrow = kMayExhaust<Method> || (kHasRecursiveResidual<Method> && !kDescendsEnergy<Method>);
 
-/// Which samples are far from solved, and have a u so large that A u rounds by much beside b: it has grown. In float32
-/// any u near a null space does, and may be the best that there is.
+/// Which samples are far from solved, and have a u so large that A u rounds by much beside b: it has grown. The
+/// rounding is ε ‖|A| |u|‖, estimated with random signs, as ε ‖A‖ ‖u‖ is large beside a penalty, too. In float32 any u
+/// near a null space is so large, and may be the best that there is.
 template <class Space, class Method>
 auto have_grown(Space& space, const Method& method, const typename Space::States& states) {
   auto grown = space.map(states, [](const SampleState&) { return false; });
   if (space.epsilon() > 1e-10) return grown;
   const auto floors = rounding_floors(space, method);
+  const auto definite = space.surely_definite();
   // All but GMRES may be on their way, in a system as badly conditioned: they are given a hundred times as much.
   const double bound = largest_floor(space) * (kMayExhaust<Method> ? 1.0 : 100.0);
+  bool any = false;
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
-    grown[i] = s.floor2 == 0.0 && s.residual2 > 1e-4 * s.b2 && floors[i] > bound * std::sqrt(s.b2);
+    grown[i] = !definite[i] && s.floor2 == 0.0 && s.residual2 > 1e-4 * s.b2 && floors[i] > bound * std::sqrt(s.b2);
+    any = any || grown[i];
   }
+  if (!any) return grown;
+  const auto rounding2 = space.values_of(space.componentwise_scale2(method.x, /*attempt=*/0));
+  for (size_t i = 0; i < states.size(); ++i)
+    grown[i] = grown[i] && space.epsilon() * std::sqrt(rounding2[i]) > 0.1 * bound * std::sqrt(states[i].b2);
   return grown;
 }
 
@@ -188,7 +196,8 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
   accept_at_rounding_floor(space, method, states);
   if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states);
   if constexpr (kDescendsEnergy<Method>) accept_by_energy(space, method, states);
-  if constexpr (kMayGrow<Method>) judge_growth(space, method, states);
+  if constexpr (kMayGrow<Method>)
+    if (track) judge_growth(space, method, states);
   bool all_last = true;
   for (auto& s : states) {
     if (s.returned == Returned::kLast) {
@@ -274,7 +283,8 @@ void replay(Space& space, Method& method, typename Space::States& states, double
   });
   conclude(space, method, states, rtol);
   take_least_of_halves(space, method, states, rtol, track);
-  if constexpr (kMayGrow<Method>) drop_grown(space, method, states, rtol, track);
+  if constexpr (kMayGrow<Method>)
+    if (track) drop_grown(space, method, states, rtol, track);
 
   const auto is_remade = space.map(states, [](const SampleState& s) { return s.returned != Returned::kLast; });
   for (size_t i = 0; i < states.size(); ++i) {

@@ -217,9 +217,9 @@ struct SolveOptions {
   /// On a GPU, the coarse grids of A, which solves with it and with its transpose share; null: nothing is kept.
   std::shared_ptr<gpu::KeptHierarchy> hierarchy{};
   /// The caller has taken off cotangents what A cannot reach: what rounding has left of it is small beside the rest.
+  bool cotangent_is_in_range = false;
   /// The channels of b are the components of one vector: a small one need not be solved by itself.
   bool channels_are_components = false;
-  bool cotangent_is_in_range = false;
   /// Only while a graph is being traced: the tolerances, if they are symbolic, each as the integer of its bits.
   c10::SymInt traced_rtol{-1}, traced_adjoint_rtol{-1};
 

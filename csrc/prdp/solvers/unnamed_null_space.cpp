@@ -41,8 +41,10 @@ at::Tensor suspects_of(const SolveInfo& info, const SolveRequest& request) {
   const auto& solver = request.solver;
   if (!info.status.is_cpu()) {
     const int64_t products = solver.max_iter.expect_int() * traits(solver.method).products;
-    const auto unsolved = info.status.eq(static_cast<int64_t>(SolveStatus::kMaxIter))
-                              .logical_or(info.status.eq(static_cast<int64_t>(SolveStatus::kStagnated)));
+    const auto is = [&](SolveStatus of) { return info.status.eq(static_cast<int64_t>(of)); };
+    auto unsolved = is(SolveStatus::kMaxIter).logical_or(is(SolveStatus::kStagnated));
+    if (!traits(solver.method).is_direct)  // where u has grown
+      unsolved = unsolved.logical_or(is(SolveStatus::kBreakdown).logical_and(info.iterations.eq(0)));
     const bool worked = rounding_grows_fast(solver) || products >= kFewProducts;
     return !worked || (request.may_wait && !unsolved.any().item<bool>()) ? at::Tensor() : unsolved;
   }
@@ -104,7 +106,8 @@ void mark_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
     // The products that tell it are dear beside few others. There, u must look as if it had grown along a constant, or
     // the solve must have gone wrong.
     suspects = suspects & ((info.operator_applications >= kManyProducts) |
-                           info.status.eq(static_cast<int64_t>(SolveStatus::kStagnated)) | (residual > 1.0) |
+                           info.status.eq(static_cast<int64_t>(SolveStatus::kStagnated)) |
+                           info.status.eq(static_cast<int64_t>(SolveStatus::kBreakdown)) | (residual > 1.0) |
                            constant_share(result.u).le(0.9).logical_not());
     if (none_left()) return;
   }

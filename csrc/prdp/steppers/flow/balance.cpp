@@ -1,6 +1,5 @@
 #include "prdp/steppers/flow/balance.h"
 
-#include <algorithm>
 #include <limits>
 
 #include "prdp/operators/tensors.h"

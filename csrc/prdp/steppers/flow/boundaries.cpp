@@ -244,7 +244,7 @@ at::Tensor fill_pockets(const FlowBox& box, const at::Tensor& obstacle) {
   const bool is_of_samples = obstacle.dim() == box.dim() + 1;
   TORCH_CHECK_VALUE((is_of_samples ? obstacle.sizes().slice(1) : obstacle.sizes()) == at::IntArrayRef(box.shape()),
                     "Flow: obstacle must have the shape of the grid, ", at::IntArrayRef(box.shape()),
-                    ", or (batch) of them, got ", obstacle.sizes());
+                    ", or (batch or 1) of them, got ", obstacle.sizes());
   auto filled = obstacle.to(at::kCPU, /*non_blocking=*/false, /*copy=*/true).contiguous();
   for (auto& solid : (is_of_samples ? filled : filled.unsqueeze(0)).unbind()) {
     const auto parts = find_parts(box, solid.logical_not());

@@ -35,7 +35,8 @@ constexpr double kLargestWholeOfThroats = 1.25;
 constexpr double kUnlimited = std::numeric_limits<float>::max();
 
 void set_largest_diffusion(const FlowBox& box, FlowFields& fields) {
-  const double dx = box.largest_dx(), across = box.sum_of_couplings() / 2 - 1 / (dx * dx);  // at worst
+  // Across the throat are all axes but one, at worst the one with the largest dx.
+  const double dx = box.largest_dx(), across = box.sum_of_couplings() / 2 - 1 / (dx * dx);
   double least = box.dx(0);
   for (int64_t axis = 1; axis < box.dim(); ++axis) least = std::min(least, box.dx(axis));
   const auto& obstacle = box.obstacle();

@@ -5,8 +5,6 @@
 #include "prdp/steppers/flow/equation.h"
 #include "prdp/steppers/flow/parts.h"
 
-/// The pieces of a step, one launch each, in place of some hundred tensor operations on a GPU. Where there is no
-/// kernel, each returns nothing, and tensor operations take its place.
 namespace prdp {
 
 /// A largest ν: of all samples, or where they differ, of each, (samples,) in float64.
@@ -17,6 +15,8 @@ struct LargestViscosity {
 
 }  // namespace prdp
 
+/// The pieces of a step, one launch each, in place of some hundred tensor operations on a GPU. Where there is no
+/// kernel, each returns nothing, and tensor operations take its place.
 namespace prdp::flow_kernels {
 
 /// Whether kernels may compute a step and its gradient: for plain tensors on a device that has a runtime, where
