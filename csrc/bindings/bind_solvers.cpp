@@ -12,6 +12,7 @@
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/solvers/warnings.h"
+#include "prdp/steppers/idle_steps.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
 #include "solves.h"

@@ -306,7 +306,7 @@ def test_what_leaves_no_fluid_is_refused():
         flow.fill_pockets(~block(PLANE))
     with pytest.raises(TypeError, match="obstacle must be a bool tensor"):
         flow.fill_pockets(torch.zeros(PLANE))
-    with pytest.raises(ValueError, match=r"the shape of the grid, \[5, 6\], or \(batch\) of them, got \[6, 5\]"):
+    with pytest.raises(ValueError, match=r"the shape of the grid, \[5, 6\], or \(batch or 1\) of them, got \[6, 5\]"):
         flow.fill_pockets(block((6, 5)))
     solids = block(PLANE, (0, 1), (1, 0))[None]  # a dead end at the inlet
     with pytest.raises(ValueError, match=r"make the cells before it solid, as with Flow\.fill_pockets"):

@@ -91,7 +91,8 @@ def test_products_take_a_lone_vector():
         torch.testing.assert_close(make(a).apply(v), a @ v)
         torch.testing.assert_close(make(a).apply_transpose(v), a.T @ v)
     with pytest.raises(
-        ValueError, match=r"shape of a channel, \[7\], got \[7\]; give n.unsqueeze\(0\) for one vector n"
+        ValueError,
+        match=r"shape of a channel, \[7\]; or \(batch, k, n\); got \[7\]; give n.unsqueeze\(0\) for one vector n",
     ):
         prdp.linear_solve(operators.Matrix(a.detach(), nullspace=v), v, SOLVERS[1])
 

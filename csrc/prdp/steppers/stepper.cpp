@@ -2,6 +2,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/solvers/status.h"
+#include "prdp/steppers/idle_steps.h"
 #include "prdp/steppers/rollout_loops.h"
 
 namespace prdp {
@@ -37,6 +38,11 @@ void StepperBase::check_state(const at::Tensor& u) const {
   TORCH_CHECK_VALUE(log_, "a stepper that was moved from makes no steps");
   TORCH_CHECK_VALUE(u.defined(), who_, ": u is an undefined tensor");
   TORCH_CHECK_VALUE(u.layout() == at::kStrided, who_, ": u must be a dense tensor, got the layout ", u.layout());
+}
+
+void StepperBase::keep(SolveInfo info) {
+  warn_of_idle_steps(info, options_.solver.rtol, options_.on_failure);
+  info_ = std::move(info);
 }
 
 void StepperBase::set_max_iter(int64_t k) {

@@ -5,7 +5,6 @@
 #include <vector>
 
 #include "prdp/solvers/solver.h"
-#include "prdp/steppers/idle_steps.h"
 
 namespace prdp {
 
@@ -48,8 +47,7 @@ class StepperBase {
     info_.reset();
     check_state(u);
     auto [next, info] = solve();
-    warn_of_idle_steps(info, options_.solver.rtol, options_.on_failure);
-    info_ = std::move(info);
+    keep(std::move(info));
     return next;
   }
 
@@ -58,6 +56,10 @@ class StepperBase {
   std::optional<SolveInfo> info_;
   AdjointLog log_;
   std::vector<AdjointLog> logs_of_steps_;  // of the last rollout, where each step has its own
+
+ private:
+  /// And warns of what it tells of a rollout.
+  void keep(SolveInfo info);
 };
 
 }  // namespace prdp
