@@ -227,10 +227,10 @@ def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Itera
     kind, given = A.kind.removeprefix("singular_"), A.tensors
     if kind != A.kind:
         given = given[:-2]  # without its null spaces, which need not be those of the operator that is changed
-    sizes = torch.maximum(A.apply(v).abs(), A.apply(w).abs())
+    here: Tensor = torch.ops.prdp.apply(v, list(given), kind, A.shape, A.parameters, False)
+    sizes = torch.maximum(here.abs(), A.apply(w).abs())
     w = w / torch.where(sizes > 0, sizes, 1.0)  # so that the rows of a product, of any sizes, count alike
     found = _C.product_rule(w, v, given, kind, A.shape, A.parameters)
-    here: Tensor = torch.ops.prdp.apply(v, list(given), kind, A.shape, A.parameters, False)
     for i, (t, gradient) in enumerate(zip(given, found, strict=True)):
         if not t.is_floating_point() or not t.numel():
             continue

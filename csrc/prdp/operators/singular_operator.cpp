@@ -9,6 +9,7 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/remembered.h"
 #include "prdp/operators/stencil_direct.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/sums_in_order.h"
@@ -64,21 +65,18 @@ class LastDisjoint {
   DisjointVectors vectors;
 
   bool matches(const at::Tensor& t, bool of_samples) const {
-    return !t.is_inference() && (!vectors || vectors.entry.device() == t.device()) &&
-           tensor_.lock().get() == t.unsafeGetTensorImpl() && version_ == t._version() && of_samples_ == of_samples;
+    const bool is_there = !vectors || vectors.entry.device() == t.device();
+    return !t.is_inference() && is_there && tensor_.matches(t) && of_samples_ == of_samples;
   }
   void store(const at::Tensor& t, bool of_samples, DisjointVectors found) {
     if (t.is_inference()) return;  // its version is not counted
-    tensor_ = Weak(t.getIntrusivePtr());
-    version_ = t._version();
+    tensor_ = TensorFingerprint(t);
     of_samples_ = of_samples;
     vectors = std::move(found);
   }
 
  private:
-  using Weak = c10::weak_intrusive_ptr<at::TensorImpl, at::UndefinedTensorImpl>;
-  Weak tensor_{c10::intrusive_ptr<at::TensorImpl, at::UndefinedTensorImpl>()};
-  int64_t version_ = 0;
+  TensorFingerprint tensor_;
   bool of_samples_ = false;
 };
 

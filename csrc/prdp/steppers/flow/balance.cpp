@@ -86,9 +86,8 @@ BalanceVjp balance_vjp(const FlowEquation& e, const FlowParts& cotangent, const 
   if (!change.defined() || !share.value.defined()) return found;
   CombinedInfo again;
   const auto whole = project(*e.box, change, options, again);
-  auto of_share = e.nu_gradient(joined(cotangent) * (whole.u - change) * share.by_nu);
-  if (potential_bar.defined()) of_share = of_share + e.nu_gradient(potential_bar * whole.potential * share.by_nu);
-  found.nu = of_share;
+  found.nu = e.nu_gradient(joined(cotangent) * (whole.u - change) * share.by_nu);
+  if (potential_bar.defined()) found.nu = found.nu + e.nu_gradient(potential_bar * whole.potential * share.by_nu);
   return found;
 }
 

@@ -238,13 +238,18 @@ FlowFields of_samples(const std::vector<FlowFields>& boxes) {
 
 }  // namespace
 
-at::Tensor fill_pockets(const FlowBox& box, const at::Tensor& obstacle) {
+void check_obstacle(const at::Tensor& obstacle, at::IntArrayRef shape) {
   TORCH_CHECK_TYPE(obstacle.scalar_type() == at::kBool,
                    "Flow: obstacle must be a bool tensor, true in solid cells, got ", obstacle.scalar_type());
-  const bool is_of_samples = obstacle.dim() == box.dim() + 1;
-  TORCH_CHECK_VALUE((is_of_samples ? obstacle.sizes().slice(1) : obstacle.sizes()) == at::IntArrayRef(box.shape()),
-                    "Flow: obstacle must have the shape of the grid, ", at::IntArrayRef(box.shape()),
-                    ", or (batch or 1) of them, got ", obstacle.sizes());
+  const auto sizes = obstacle.sizes();
+  const bool fits = sizes == shape || (sizes.size() == shape.size() + 1 && sizes.slice(1) == shape);
+  TORCH_CHECK_VALUE(fits, "Flow: obstacle must have the shape of the grid, ", shape, ", or (batch or 1) of them, got ",
+                    sizes);
+}
+
+at::Tensor fill_pockets(const FlowBox& box, const at::Tensor& obstacle) {
+  check_obstacle(obstacle, box.shape());
+  const bool is_of_samples = obstacle.dim() > box.dim();
   auto filled = obstacle.to(at::kCPU, /*non_blocking=*/false, /*copy=*/true).contiguous();
   for (auto& solid : (is_of_samples ? filled : filled.unsqueeze(0)).unbind()) {
     const auto parts = find_parts(box, solid.logical_not());

@@ -7,6 +7,9 @@ namespace prdp {
 /// comes in from going out.
 FlowFields make_flow_fields(const FlowBox& box);
 
+/// Raises ValueError or TypeError unless it is bool (*shape) or (samples, *shape).
+void check_obstacle(const at::Tensor& obstacle, at::IntArrayRef shape);
+
 /// `obstacle`, bool (*shape) or (batch, *shape), and what nothing flows through: all fluid but the largest connected
 /// part or, in a box with an open axis, the parts that join its two ends. `box` has no obstacle. Raises ValueError if
 /// no fluid is left.

@@ -76,15 +76,9 @@ FlowBox::FlowBox(std::vector<int64_t> shape, const std::vector<FlowBoundary>& bo
                     "Flow: at most one axis may be open");
   const c10::InferenceMode may_be_recorded_later(false);
   if (obstacle_.defined()) {
-    TORCH_CHECK_TYPE(obstacle_.scalar_type() == at::kBool,
-                     "Flow: obstacle must be a bool tensor, true in solid cells, got ", obstacle_.scalar_type());
-    const bool is_of_all = obstacle_.sizes() == at::IntArrayRef(shape_);
-    TORCH_CHECK_VALUE(
-        is_of_all || (obstacle_.dim() == dim() + 1 && obstacle_.sizes().slice(1) == at::IntArrayRef(shape_)),
-        "Flow: obstacle must have the shape of the grid, ", at::IntArrayRef(shape_), ", or (batch or 1) of them, got ",
-        obstacle_.sizes());
+    check_obstacle(obstacle_, shape_);
     obstacle_ = obstacle_.detach().to(at::kCPU, /*non_blocking=*/false, /*copy=*/true).contiguous();
-    if (is_of_all) obstacle_ = obstacle_.unsqueeze(0);
+    if (obstacle_.dim() == dim()) obstacle_ = obstacle_.unsqueeze(0);
     samples_ = obstacle_.size(0);
     if (!obstacle_.any().item<bool>()) obstacle_ = at::Tensor();
   }
