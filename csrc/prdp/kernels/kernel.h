@@ -21,6 +21,14 @@ class Factors {
   virtual ~Factors() = default;
   /// d = A⁻¹ r in padded memory; false if A is singular.
   virtual bool solve(const T* r, T* d) const = 0;
+  /// Whether several right-hand sides together take less time than one after the other; and that, with the same bits
+  /// for each as alone.
+  virtual bool gains_by_several() const { return false; }
+  virtual bool solve_several(const T* const* r, T* const* d, int64_t count) const {
+    bool found = true;
+    for (int64_t i = 0; i < count; ++i) found &= solve(r[i], d[i]);
+    return found;
+  }
 };
 
 /// factor()·A on one channel of one sample, as a stencil on a grid.

@@ -115,12 +115,20 @@ class CsrFactors final : public Factors<T> {
       : n_(a.unknowns()),
         transposed_(a.transposed()),
         sparse_(sparse_factors(a, a.key(), a.transposed(), n_, pins_of(a.null_space(), a.left_null_space(), 0))) {}
-  bool solve(const T* r, T* d) const override {
+  bool gains_by_several() const override { return sparse_->gains_by_several(); }
+  bool solve(const T* r, T* d) const override { return solve_several(&r, &d, 1); }
+  bool solve_several(const T* const* r, T* const* d, int64_t count) const override {
     if (!sparse_->is_regular()) return false;
-    Eigen::VectorXd x = Eigen::Map<const Values<T>>(r, n_).template cast<double>();
+    Eigen::MatrixXd x(n_, count);
+    for (int64_t i = 0; i < count; ++i) x.col(i) = Eigen::Map<const Values<T>>(r[i], n_).template cast<double>();
     sparse_->solve(x, transposed_);
-    Eigen::Map<Values<T>>(d, n_) = x.template cast<T>();
-    return Eigen::Map<Values<T>>(d, n_).allFinite();
+    bool finite = true;
+    for (int64_t i = 0; i < count; ++i) {
+      Eigen::Map<Values<T>> found(d[i], n_);
+      found = x.col(i).template cast<T>();
+      finite &= found.allFinite();
+    }
+    return finite;
   }
 
  private:

@@ -7,6 +7,7 @@
 #include <limits>
 #include <numeric>
 
+#include "prdp/kernels/cholesky_solve.h"
 #include "prdp/kernels/equilibration.h"
 #include "prdp/threads/thread_to_leave.h"
 
@@ -163,21 +164,56 @@ SparseFactors::~SparseFactors() = default;
 
 bool SparseFactors::is_regular() const { return factorised_->is_regular; }
 
-void SparseFactors::solve(Eigen::VectorXd& x, bool transposed) const {
+bool SparseFactors::gains_by_several() const { return factorised_->cholesky.has_value(); }
+
+void SparseFactors::solve(Eigen::Ref<Eigen::MatrixXd> x, bool transposed) const {
   const auto& to_take = transposed ? kept_unknowns_ : kept_equations_;
   const auto& to_give = transposed ? kept_equations_ : kept_unknowns_;
-  const auto n = static_cast<int64_t>(x.size());
-  Eigen::VectorXd rhs(to_take.size() == 0 ? 0 : to_take.maxCoeff() + 1);
-  for (int64_t i = 0; i < n; ++i)
-    if (to_take[i] >= 0) rhs[to_take[i]] = x[i];
+  if (factorised_->cholesky) {
+    solve_by_cholesky<8>(x, to_take, to_give);
+    return;
+  }
   const auto& scales = factorised_->scales;
-  if (scales) rhs.array() *= (transposed ? scales->columns : scales->rows).array();
-  Eigen::VectorXd found;
-  if (factorised_->cholesky) found = factorised_->sign * factorised_->cholesky->solve(rhs);
-  else if (transposed) found = factorised_->lu.transpose().solve(rhs);
-  else found = factorised_->lu.solve(rhs);
-  if (scales) found.array() *= (transposed ? scales->rows : scales->columns).array();
-  for (int64_t i = 0; i < n; ++i) x[i] = to_give[i] >= 0 ? found[to_give[i]] : 0.0;
+  const auto n = static_cast<int64_t>(x.rows());
+  Eigen::VectorXd rhs(to_take.size() == 0 ? 0 : to_take.maxCoeff() + 1), found;
+  for (auto column : x.colwise()) {
+    for (int64_t i = 0; i < n; ++i)
+      if (to_take[i] >= 0) rhs[to_take[i]] = column[i];
+    if (scales) rhs.array() *= (transposed ? scales->columns : scales->rows).array();
+    if (transposed) found = factorised_->lu.transpose().solve(rhs);
+    else found = factorised_->lu.solve(rhs);
+    if (scales) found.array() *= (transposed ? scales->rows : scales->columns).array();
+    for (int64_t i = 0; i < n; ++i) column[i] = to_give[i] >= 0 ? found[to_give[i]] : 0.0;
+  }
+}
+
+template <int Count>
+void SparseFactors::solve_by_cholesky(Eigen::Ref<Eigen::MatrixXd> x, const Eigen::VectorXi& to_take,
+                                      const Eigen::VectorXi& to_give) const {
+  Eigen::Index column = 0;
+  for (; column + Count <= x.cols(); column += Count) {
+    solve_block<Count>(x.middleCols<Count>(column), to_take, to_give);
+  }
+  if constexpr (Count > 1) solve_by_cholesky<Count / 2>(x.rightCols(x.cols() - column), to_take, to_give);
+}
+
+template <int Count>
+void SparseFactors::solve_block(Block<Count> x, const Eigen::VectorXi& to_take, const Eigen::VectorXi& to_give) const {
+  const auto& cholesky = *factorised_->cholesky;
+  const auto& place = cholesky.permutationP().indices();
+  static thread_local std::vector<double> side_by_side;
+  side_by_side.resize(place.size() * Count);
+  double* const memory = side_by_side.data();
+  for (int64_t i = 0; i < x.rows(); ++i) {
+    if (to_take[i] < 0) continue;
+    double* const to = memory + int64_t{place[to_take[i]]} * Count;
+    for (int c = 0; c < Count; ++c) to[c] = x(i, c);
+  }
+  solve_cholesky<Count>(cholesky.matrixL().nestedExpression(), memory);
+  for (int64_t i = 0; i < x.rows(); ++i) {
+    const double* const from = to_give[i] >= 0 ? memory + int64_t{place[to_give[i]]} * Count : nullptr;
+    for (int c = 0; c < Count; ++c) x(i, c) = from ? factorised_->sign * from[c] : 0.0;
+  }
 }
 
 int64_t SparseFactors::bytes() const {

@@ -38,24 +38,27 @@ class StencilFactors final : public Factors<T> {
     if (a.rows() > 1)
       axes_ = fast_diagonalisation(a, key, kernel.null_space() ? kernel.null_space()->count_in_one_field() : 0);
     if (axes_) return;  // of a symmetric A, its own transpose
-    sparse_ = sparse_factors(a, key, transposed, layout_.rows * layout_.nx,
-                             pins_of(kernel.null_space(), kernel.left_null_space(), 0));
+    sparse_ = sparse_factors(a, key, transposed, points(), pins_of(kernel.null_space(), kernel.left_null_space(), 0));
   }
+  bool gains_by_several() const override { return sparse_ && sparse_->gains_by_several(); }
   bool solve(const T* r, T* d) const override {
     if (axes_) return solve_along_axes(r, d);
-    if (sparse_ ? !sparse_->is_regular() : !thomas_->is_regular()) return false;
+    if (!thomas_) return solve_several(&r, &d, 1);
+    if (!thomas_->is_regular()) return false;
     Eigen::VectorXd x = values_of(r, layout_);
-    const int64_t points = layout_.rows * layout_.nx;
-    for (int64_t channel = 0; channel < layout_.planes; ++channel) {
-      if (thomas_) {
-        thomas_->solve(x.data() + channel * points);
-        continue;
-      }
-      Eigen::VectorXd field = x.segment(channel * points, points);
-      sparse_->solve(field, transposed_);  // its factors are those of A; thomas_ has the rows as they are
-      x.segment(channel * points, points) = field;
-    }
+    for (int64_t channel = 0; channel < layout_.planes; ++channel) thomas_->solve(x.data() + channel * points());
     return store_if_finite(x, layout_, d);
+  }
+  bool solve_several(const T* const* r, T* const* d, int64_t count) const override {
+    if (!sparse_) return Factors<T>::solve_several(r, d, count);
+    if (!sparse_->is_regular()) return false;
+    Eigen::MatrixXd x(points(), layout_.planes * count);
+    const auto of_sample = [&](int64_t i) { return x.middleCols(i * layout_.planes, layout_.planes); };
+    for (int64_t i = 0; i < count; ++i) of_sample(i).reshaped() = values_of(r[i], layout_);
+    sparse_->solve(x, transposed_);  // its factors are those of A; thomas_ has the rows as they are
+    bool finite = true;
+    for (int64_t i = 0; i < count; ++i) finite &= store_if_finite<T>(of_sample(i).reshaped(), layout_, d[i]);
+    return finite;
   }
 
  private:
@@ -64,15 +67,15 @@ class StencilFactors final : public Factors<T> {
     static thread_local std::vector<T> values, field;
     values.resize(layout_.unknowns());
     layout_.store(r, T(1), values.data());
-    const int64_t points = layout_.rows * layout_.nx;
-    for (auto at = values.begin(); at != values.end(); at += points) {
-      field.assign(at, at + points);
+    for (auto at = values.begin(); at != values.end(); at += points()) {
+      field.assign(at, at + points());
       axes_->solve(field);
       std::copy(field.begin(), field.end(), at);
     }
     layout_.load(values.data(), T(1), d);
     return std::isfinite(largest_magnitude(values.data(), layout_.unknowns()));
   }
+  int64_t points() const { return layout_.rows * layout_.nx; }
 
   Layout<T> layout_;
   bool transposed_;

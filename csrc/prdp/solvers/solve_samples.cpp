@@ -3,6 +3,7 @@
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/sample_space.h"
 #include "prdp/solvers/solve_sample.h"
+#include "prdp/solvers/solved_ahead.h"
 
 namespace prdp {
 
@@ -39,7 +40,10 @@ class OpenSamples {
  public:
   OpenSamples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>* shared, const SampleBatch<T>& batch,
               int64_t begin, int64_t end)
-      : kernels_(kernels), shared_(shared), batch_(batch), index_(begin - 1), end_(end) {}
+      : kernels_(kernels), shared_(shared), batch_(batch), index_(begin - 1), end_(end) {
+    if (shared && SolvedAhead<T>::pays(*shared, batch, end - begin))
+      ahead_ = std::make_shared<SolvedAhead<T>>(*shared, batch, end);
+  }
 
   /// Goes to the next one, and sets its system; false behind the last.
   bool next() {
@@ -49,9 +53,13 @@ class OpenSamples {
       const T* const b = batch_.arrays.b + index_ * batch_.unknowns;
       given_ = batch_.arrays.sample(index_, batch_.unknowns, kernels::largest_magnitude(b, batch_.unknowns));
       if (report_if_settled(batch_, index_, given_, a)) continue;
+      if (ahead_) ahead_->come_to(index_);
       if (shared_ && is_set_) return true;
       const auto& solver = batch_.solver;
-      is_set_ = system_.set(*a, solver.preconditioner, shared_ ? shared_->factors : factors_of(*a, solver));
+      is_set_ = system_.set(*a, solver.preconditioner,
+                            ahead_    ? ahead_
+                            : shared_ ? shared_->factors
+                                      : factors_of(*a, solver));
       if (is_set_) return true;
       report(batch_, index_, zero_instead(SolveStatus::kZeroDiagonal));
     }
@@ -66,6 +74,7 @@ class OpenSamples {
   const SharedSystem<T>* shared_;
   const SampleBatch<T>& batch_;
   int64_t index_, end_;
+  std::shared_ptr<SolvedAhead<T>> ahead_{};  // only where that pays
   std::unique_ptr<kernels::Kernel<T>> own_{};
   GivenSample<T> given_{};
   SampleSystem<T> system_{};
