@@ -38,9 +38,68 @@ def test_each_solve_looks_once_for_what_is_captured():
         return k * v
 
     a = operators.Function(matvec, tensors=torch.tensor([2.0], dtype=torch.float64, requires_grad=True))
-    for _ in range(2):
+    for _ in range(4):
         prdp.linear_solve(a, right_hand_side(), prdp.GMRES(3))
-    assert sum(recorded) == 2
+    assert sum(recorded) == 4 + 3  # in the 1st, 2nd and 4th also for tensors that no derivative reaches
+
+
+def stiffness(x, k):
+    """The gradient of the energy of springs of stiffness k."""
+    return torch.autograd.grad((k * (x.diff() ** 2 + 0.1 * x.diff() ** 4)).sum(), x, create_graph=True)[0]
+
+
+def hessian_product(create_graph):
+    def matvec(v, x, k, m):
+        with torch.enable_grad():
+            y = x.detach().requires_grad_()
+            return m * v + torch.autograd.grad(stiffness(y, k), y, v, create_graph=create_graph)[0]
+
+    return matvec
+
+
+def springs(n=9):
+    g = torch.Generator().manual_seed(1)
+    x = torch.randn(1, n, dtype=torch.float64, generator=g)
+    k, m = (torch.rand(size, dtype=torch.float64, generator=g) + 1 for size in (n - 1, n))
+    return x, k.requires_grad_(), m.requires_grad_(), torch.randn(1, n, dtype=torch.float64, generator=g)
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("solver", [prdp.CG(60, rtol=1e-13), prdp.MINRES(60, rtol=1e-13), prdp.Direct()], ids=repr)
+def test_a_product_may_take_a_derivative_by_a_leaf_of_its_own(solver, backward):
+    x, k, m, b = springs()
+    backward = "implicit" if isinstance(solver, prdp.Direct) else backward
+    a = operators.Function(hessian_product(create_graph=True), tensors=(x, k, m), symmetric=True)
+    u, _ = prdp.linear_solve(a, b, solver, backward=backward)
+    y = x.clone().requires_grad_()
+    hessian = torch.stack([torch.autograd.grad(g, y, create_graph=True)[0][0] for g in stiffness(y, k)[0]])
+    exact = torch.linalg.solve(hessian + torch.diag(m), b[0])[None]
+    torch.testing.assert_close(u, exact, rtol=1e-9, atol=1e-11)
+    found, expected = (torch.autograd.grad(v.square().sum(), (k, m)) for v in (u, exact))
+    for g, h in zip(found, expected, strict=True):
+        torch.testing.assert_close(g, h, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_a_tensor_that_no_derivative_reaches_is_named(backward, always):
+    x, k, m, b = springs()
+    a = operators.Function(hessian_product(create_graph=False), tensors=(x, k, m), symmetric=True)
+    with pytest.warns(UserWarning, match=r"tensors\[1\] requires grad, but autograd records nothing .* torch.func.jvp"):
+        prdp.linear_solve(a, b, prdp.CG(60), backward=backward)
+    fixed = operators.Function(hessian_product(create_graph=False), tensors=(x, k.detach(), m), symmetric=True)
+    prdp.linear_solve(fixed, b, prdp.CG(60), backward=backward)
+
+
+def test_what_is_captured_beside_a_leaf_of_the_product_is_refused():
+    x, k, m, b = springs()
+    inner = hessian_product(create_graph=True)
+    a = operators.Function(lambda v, x, m: inner(v, x, k, m), tensors=(x, m), symmetric=True)
+    with pytest.raises(ValueError, match="matvec uses a tensor that requires grad but is not among its tensors"):
+        prdp.linear_solve(a, b, prdp.CG(60))
+    captured = 2 * k  # not a leaf
+    a = operators.Function(lambda v, x, m: inner(v, x, captured, m), tensors=(x, m), symmetric=True)
+    with pytest.raises(ValueError, match="matvec uses a tensor that requires grad but is not among its tensors"):
+        prdp.linear_solve(a, b, prdp.CG(60))
 
 
 def test_a_captured_parameter_may_be_frozen_for_a_while():

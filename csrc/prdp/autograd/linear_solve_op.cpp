@@ -8,6 +8,7 @@
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"
+#include "prdp/autograd/unreached_tensors.h"
 #include "prdp/operators/function_checks.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
@@ -118,6 +119,8 @@ SolveOutputs solve_with_node(const at::Tensor& b, const OperatorSpec& a, const S
   const bool reverse =
       differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));
+  const bool is_plain_function = is_function(a) && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
+  if (reverse && is_plain_function && any_requires_grad(a.tensors)) warn_of_unreached_tensors(a, b);
   const auto node = reverse ? make_node<SolveNode>(b, a, options) : nullptr;
   const auto out = call_op_below_autograd(b, a, node ? node->options() : options, x0);
   const auto& [u, iterations, residual, status, applications, floor] = out;

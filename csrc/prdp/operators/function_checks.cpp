@@ -7,6 +7,7 @@
 #include <cmath>
 
 #include "prdp/error_text.h"
+#include "prdp/operators/graph_leaves.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/registered_products.h"
@@ -65,12 +66,21 @@ void check_samples_are_apart(const Operator& a, const at::Tensor& b) {
 
 const char* product_name() { return in_language("matvec", "apply"); }
 
-void check_nothing_is_captured(const at::Tensor& result, bool reverse) {
-  TORCH_CHECK_VALUE(!(reverse && result.requires_grad()) && !has_tangent(result), "Function: ", product_name(),
+at::Tensor product_without_captures(const std::function<at::Tensor()>& product, bool reverse) {
+  const auto result = product();
+  const auto is_captured = [&] {
+    if (!reverse || !result.requires_grad()) return false;
+    // A leaf that the product makes, to take a derivative by it, is another one in each call.
+    const auto again = product();
+    const auto leaves = leaves_of(result), others = leaves_of(again);
+    return std::any_of(leaves.begin(), leaves.end(), [&](const auto* leaf) { return others.contains(leaf); });
+  };
+  TORCH_CHECK_VALUE(!has_tangent(result) && !is_captured(), "Function: ", product_name(),
                     " uses a tensor that requires grad",
                     has_tangent(result) || in_torch_func() ? ", or that forward mode or torch.func follows," : "",
                     " but is not among its tensors, so that no gradient would reach it; hand it over in tensors, or "
                     "detach it");
+  return result.detach();
 }
 
 void refuse_captured_gradients(const OperatorSpec& a) { products_of(a)->looks_for_captures = true; }
@@ -81,7 +91,7 @@ void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b) {
   for (auto& t : constant.tensors) t = primal(t).detach();
   const auto v = primal(b).detach();
   const bool reverse = at::GradMode::is_enabled();
-  check_nothing_is_captured(with_autograd([&] { return make_operator(constant)->apply(v); }), reverse);
+  product_without_captures([&] { return with_autograd([&] { return make_operator(constant)->apply(v); }); }, reverse);
 }
 
 void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b) {

@@ -1,4 +1,6 @@
 #pragma once
+#include <functional>
+
 #include "prdp/operators/operator.h"
 
 /// What the products of a Function are refused for.
@@ -7,8 +9,9 @@ namespace prdp {
 /// What messages call the product with A.
 const char* product_name();
 
-/// Raises ValueError if a product of constants has a derivative, in reverse mode only if that is asked for.
-void check_nothing_is_captured(const at::Tensor& result, bool reverse = true);
+/// A product of constants, detached. Raises ValueError if it has a derivative: in forward mode any, in reverse mode, if
+/// that is asked for, one by a tensor that was there before.
+at::Tensor product_without_captures(const std::function<at::Tensor()>& product, bool reverse = true);
 
 /// A product that captures a tensor which requires grad, instead of getting it as an argument, would silently lose its
 /// gradient. After this call, the operator's next product below autograd raises ValueError in that case, at the cost of

@@ -136,7 +136,9 @@ void FunctionOperator::check_vector(const at::Tensor& b) const {
 
 at::Tensor FunctionOperator::apply(const at::Tensor& v) const {
   if (registered_->looks_for_captures && !at::GradMode::is_enabled()) return product_checking_captures(v);
-  return product(registered_->products().apply, v, tensors_, product_name());
+  const auto result = product(registered_->products().apply, v, tensors_, product_name());
+  // A derivative that the product takes itself leaves its graph on it.
+  return at::GradMode::is_enabled() || !result.requires_grad() ? result : result.detach();
 }
 
 at::Tensor FunctionOperator::apply_transpose(const at::Tensor& v) const {
@@ -167,11 +169,12 @@ at::Tensor FunctionOperator::product(const Products::Product& function, const at
 }
 
 at::Tensor FunctionOperator::product_checking_captures(const at::Tensor& v) const {
-  const auto result = with_autograd(
-      [&] { return product(registered_->products().apply, v.detach(), detached(tensors_), product_name()); });
-  check_nothing_is_captured(result);
+  const auto result = product_without_captures([&] {
+    return with_autograd(
+        [&] { return product(registered_->products().apply, v.detach(), detached(tensors_), product_name()); });
+  });
   registered_->looks_for_captures = false;
-  return result;  // no graph hangs on it
+  return result;
 }
 
 at::Tensor FunctionOperator::recorded_product(const at::Tensor& v, const std::vector<at::Tensor>& tensors) const {
