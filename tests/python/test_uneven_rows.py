@@ -112,6 +112,82 @@ def test_jumps_of_kappa_say_nothing_where_u_is_right(contrast, solver, always):
     assert not said and (u - exact).abs().max() < 1e-2 * exact.abs().max()
 
 
+def islands(void, n=48, dtype=F64):
+    """Three pieces that conduct heat, in a void that hardly does, far from the sources."""
+    kappa = torch.ones(1, n, n, dtype=dtype)
+    kappa[0, 16:32, 8:40] = void
+    kappa[0, 20:24, 14:18] = kappa[0, 26:29, 28:34] = kappa[0, 18:19, 22:26] = 1
+    b = torch.zeros(1, 1, n, n, dtype=dtype)
+    b[0, 0, 2:6, 20:28] = 1
+    return operators.Diffusion(kappa, boundary=["flux", ("zero", "flux")]), b
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("preconditioner", [None, "diagonal", "multigrid"])
+@pytest.mark.parametrize("void", [1e-5, 1e-9])
+def test_a_piece_that_floats_in_a_void_is_said_with_its_error(void, preconditioner, dtype, always):
+    a, b = islands(void, dtype=dtype)
+    exact, _ = prdp.linear_solve(*islands(void), prdp.Direct())
+    (u, info), said = warnings_of(lambda: prdp.linear_solve(a, b, prdp.CG(9000, preconditioner=preconditioner)))
+    error = ((u - exact).abs().amax() / u.abs().amax()).item()
+    said = [text for text in said if "CONVERGED to rtol" in text]
+    assert len(said) == (info.status.item() == prdp.SolveStatus.CONVERGED and error > 1e-3)
+    for text in said:
+        claimed = float(text.split("least about ")[1].split(" %")[0]) / 100
+        assert 0.5 * error < claimed < 1.1 * error
+    if dtype == F64:
+        assert (preconditioner, void) == ("multigrid", 1e-5) or len(said) == 1
+        rtol = float(said[0].split("rtol, such as ")[1].split(". ")[0]) if said else 1e-8
+        solver = prdp.CG(30000, rtol, preconditioner=preconditioner)
+        (u, _), said = warnings_of(lambda: prdp.linear_solve(a, b, solver))
+        assert ((u - exact).abs().amax() < 1e-3 * exact.abs().amax()) == (not said)
+
+
+@pytest.mark.parametrize("weight", [1e2, 1e3, 1e4])
+def test_the_error_beside_a_soft_penalty_is_that_of_its_smooth_part(weight, always):
+    """It is many times what the residual of a row tells."""
+    a, b = penalty(weight, n=200)
+    exact = torch.linalg.solve(a, b[0])[None]
+    (u, info), said = warnings_of(lambda: prdp.linear_solve(a, b, prdp.CG(2000, rtol=1e-4)))
+    error = ((u - exact).abs().max() / u.abs().max()).item()
+    assert info.solved.all() and len(said) == (error > 1e-2)
+    for text in said:
+        claimed = float(text.split("least about ")[1].split(" %")[0]) / 100
+        assert 0.5 * error < claimed < 1.1 * error
+
+
+def test_contact_that_begins_late_is_said():
+    """Solves are looked at seldom, but anew where they take another number of iterations."""
+    n = 190
+    a = 3 * torch.eye(n, dtype=F64) - torch.diag(torch.ones(n - 1), 1) - torch.diag(torch.ones(n - 1), -1)
+    generator = torch.Generator().manual_seed(0)
+
+    def step(contact):
+        b = -1 - 0.1 * torch.rand(1, n, dtype=F64, generator=generator)
+        stiff = a.clone()
+        if contact:
+            stiff[7, 7] += 1e8
+            b[0, 7] += 1e6
+        return prdp.linear_solve(stiff, b, prdp.CG(2000))
+
+    assert not warnings_of(lambda: [step(contact=False) for _ in range(37)])[1]
+    _, said = warnings_of(lambda: step(contact=True))
+    assert len(said) == 1 and "times as large as others" in said[0]
+
+
+def test_an_adjoint_solve_speaks_of_the_gradient(always):
+    a, b = penalty(1e7)
+    leaf = torch.ones_like(b, requires_grad=True)
+
+    def gradient():
+        u, _ = prdp.linear_solve(a, leaf, prdp.CG(500), adjoint_rtol=1e-6)
+        torch.autograd.grad(u, leaf, b)
+
+    _, said = warnings_of(gradient)
+    (text,) = [text for text in said if text.startswith("adjoint solve")]
+    assert "its solution, which the gradient is made of, is off by" in text and "smaller adjoint_rtol, such as" in text
+
+
 @pytest.mark.parametrize("start", [False, True])
 @pytest.mark.parametrize("solver", [prdp.CG(500), prdp.CG(50, preconditioner="multigrid")], ids=repr)
 def test_a_small_channel_beside_a_large_one_is_said(solver, start, always):

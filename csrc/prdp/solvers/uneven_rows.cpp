@@ -4,6 +4,7 @@
 #include <c10/util/hash.h>
 
 #include <algorithm>
+#include <bit>
 
 #include "prdp/error_text.h"
 #include "prdp/gpu/runtime.h"
@@ -12,6 +13,7 @@
 #include "prdp/operators/probes.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
+#include "prdp/solvers/unnamed_null_space.h"
 #include "prdp/solvers/warnings.h"
 
 namespace prdp {
@@ -32,13 +34,19 @@ at::Tensor size_of_rows(const Operator& a, const at::Tensor& like) {
 
 /// An approximate lower bound of the error at each point of a small row, as a share of the largest |u|:
 /// |r_i| / (‖a_i‖ max |u|).
-at::Tensor shares_of_error(const Operator& a, const at::Tensor& b, const at::Tensor& u, const at::Tensor& residual) {
+at::Tensor shares_of_error(const at::Tensor& rows, const at::Tensor& b, const at::Tensor& u,
+                           const at::Tensor& residual) {
   constexpr double much_larger = 10.0;
   const auto left = residual.abs().to(at::kDouble);
-  const auto rows = size_of_rows(a, b).to(at::kDouble);
   const auto largest = per_sample(sample_maxima(rows), b), size = per_sample(sample_maxima(u), b);
   const auto tells = rows.gt(0) & (rows * much_larger).lt(largest) & size.gt(0);
   return at::where(tells, left / (rows * size), 0.0);
+}
+
+/// How much larger the largest row is than the least that is not zero.
+double spread_of(const at::Tensor& rows) {
+  const auto there = rows.masked_select(rows > 0);
+  return there.numel() == 0 ? 1.0 : (there.max() / there.min()).item<double>();
 }
 
 /// Rows of these differ at the boundary alone: there is no need to look.
@@ -82,21 +90,47 @@ void warn_of_small_channels(const Look& look) {
   });
 }
 
-void warn_of_small_rows(const Look& look, const Operator& a) {
+/// How far u changes, as a share of its largest entry, when the solve goes on in float64 to a much smaller residual,
+/// for no more than about twice as many iterations. Along a constant that A maps to rounding, u may change at will.
+at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const SolveInfo& info) {
+  constexpr double less = 1e-4, least = 1e-13;
+  auto spec = look.role.a;
+  for (auto& t : spec.tensors)
+    if (at::isFloatingType(t.scalar_type())) t = t.to(at::kDouble);
+  auto solver = look.role.solver;
+  solver.rtol = std::max(less * solver.rtol, least);
+  solver.max_iter = 2 * info.iterations.max().item<int64_t>() + 100;
+  const auto u = look.u.to(at::kDouble);
+  const auto further = solve(*make_operator(spec), look.b.to(at::kDouble), {.solver = solver, .x0 = u}).u;
+  const auto changes = (further - u).abs() / per_sample(sample_maxima(u), u);
+  const auto is_singular = maps_constant_to_zero(a, look.b, /*transposed=*/false, /*jointly=*/true);
+  return changes.masked_fill(per_sample(is_singular, u), 0.0).nan_to_num(0.0, 0.0, 0.0);
+}
+
+void warn_of_small_rows(const Look& look, const Operator& a, const SolveInfo& info) {
+  constexpr double wide = 30.0;
   const double rtol = look.role.solver.rtol;
-  const auto shares = shares_of_error(a, look.b, look.u, look.residual);
+  const auto rows = size_of_rows(a, look.b).to(at::kDouble);
+  auto shares = shares_of_error(rows, look.b, look.u, look.residual);
+  const double spread = spread_of(rows);
+  if (spread > wide && look.much() < 1.0 && !look.role.solver.preconditioner.is_operator())
+    shares = at::maximum(shares, changes_by_more_iterations(look, a, info));
   const auto worst_of = shares.flatten(1).amax(1).masked_fill(look.converged.logical_not(), 0.0);
   const auto i = worst_of.argmax().item<int64_t>();
   const double worst = worst_of[i].item<double>();
   if (!(worst > look.much())) return;
+  const bool adjoint = look.role.adjoint;
   warn_once(look.key("uneven rows "), worst, [&](std::ostream& text) {
     const auto place = shares[i].eq(worst);
-    text << look.beginning(i) << "u is off by at least about " << three_digits(100.0 * worst)
-         << " % of its largest entry at index " << as_tuple(first_true(place))
-         << ": other rows of A, such as those of a penalty, are much larger and make up ‖b‖. Take "
+    text << look.beginning(i) << (adjoint ? "its solution, which the gradient is made of," : "u")
+         << " is off by at least about " << three_digits(100.0 * worst) << " % of its largest entry at index "
+         << as_tuple(first_true(place))
+         << ": some rows of A, such as those of a penalty or where a coefficient is large, are up to "
+         << three_digits(spread) << " times as large as others, and a residual beside them tells little of these. Take "
          << in_language("Direct()", "Direct{}");
     const double enough = rtol * (rtol / worst);  // the error falls with rtol, here to about rtol
-    if (enough > 100.0 * epsilon_of(look.b)) text << " or a smaller rtol, such as " << three_digits(enough);
+    if (enough > 100.0 * epsilon_of(look.b))
+      text << " or a smaller " << (adjoint ? "adjoint_rtol" : "rtol") << ", such as " << three_digits(enough);
   });
 }
 
@@ -110,7 +144,10 @@ void warn_of_uneven_rows(const SolveRole& role, const Operator& a, const at::Ten
   if (!(solver.rtol > 0.0) || traits(solver.method).is_direct || (!looks_at_rows && !looks_at_channels)) return;
   if (!b.is_cpu() || gpu::runtime_of(b.device()) || b.numel() == 0 || !is_plain(b) || !all_plain(role.a.tensors))
     return;
-  if (!should_look(c10::get_hash(role.a.kind, role.adjoint, static_cast<int>(solver.method), b.sizes().slice(1).vec())))
+  // Systems of another kind, such as those of a contact that begins, take another number of iterations.
+  const auto order = std::bit_width(static_cast<uint64_t>(result.info.iterations.max().item<int64_t>()));
+  if (!should_look(
+          c10::get_hash(role.a.kind, role.adjoint, static_cast<int>(solver.method), order, b.sizes().slice(1).vec())))
     return;
   const at::NoGradGuard no_grad;
   const auto& status = result.info.status;
@@ -119,7 +156,7 @@ void warn_of_uneven_rows(const SolveRole& role, const Operator& a, const at::Ten
   const Look look{role, b, result.u, residual,
                   is(SolveStatus::kConverged).logical_or(is(SolveStatus::kConvergedBreakdown))};
   if (looks_at_channels) warn_of_small_channels(look);
-  if (looks_at_rows) warn_of_small_rows(look, a);
+  if (looks_at_rows) warn_of_small_rows(look, a, result.info);
 }
 
 }  // namespace prdp
