@@ -34,6 +34,7 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
     - every tensor that requires grad is among the tensors of the operator;
     - ⟨A v, w⟩ = ⟨v, Aᵀ w⟩;
     - the diagonal, if there is one, agrees with products with unit vectors (at most 256 of them);
+    - no row of A is zero, unless a `nullspace` is named;
     - A maps its `nullspace` to zero, and A and Aᵀ the constant only if it is named; in float64, and of at most
       256 unknowns, A maps no other vector to zero;
     - the gradient of ⟨w, A v⟩ for each tensor agrees with finite differences in one random direction;
@@ -122,6 +123,13 @@ def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
             yield str(error).removeprefix(f"{type(A).__name__}: ")
             return
         yield from _unnamed_null_vectors(A, v)
+        return
+
+    empty = (A.apply(v) == 0) & (A.apply(v.flatten(1).roll(1, 1).view_as(v)) == 0)
+    if empty.any():
+        count, first = int(empty.flatten(1).sum(1).max()), tuple(empty.nonzero()[0, 1:].tolist())
+        rows = f"row {first} of A is zero" if count == 1 else f"{count} rows of A are zero, such as {first}"
+        yield f"{rows}: put 1 on the diagonal there, or leave these unknowns out"
         return
 
     def is_mapped_to_zero(constant: Tensor, by: Callable[[Tensor], Tensor] = A.apply) -> bool:

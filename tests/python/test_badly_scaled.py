@@ -153,6 +153,7 @@ def test_what_cannot_solve_with_a_penalty_says_why(solver):
         solve("dense", with_penalties(1e30), torch.ones(50, dtype=F64), solver)
 
 
+@pytest.mark.filterwarnings("ignore:.* did not reach rtol")
 @pytest.mark.parametrize(
     "solver",
     [

@@ -6,6 +6,7 @@
 
 #include "prdp/error_text.h"
 #include "prdp/kernels/kernel.h"
+#include "prdp/operators/probes.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/null_space_messages.h"
 #include "prdp/solvers/unfit.h"
@@ -61,6 +62,26 @@ std::string badly_scaled(const FailedSample& sample, bool columns) {
 std::string badly_scaled(const FailedSample& sample) {
   auto rows = badly_scaled(sample, /*columns=*/false);
   return rows.empty() ? badly_scaled(sample, /*columns=*/true) : rows;
+}
+
+/// A row of A that is zero, or a column.
+std::string empty_line(const FailedSample& sample) {
+  if (is_singular(sample.role.a)) return {};  // somebody has named what it maps to zero
+  const auto v = unstructured_like(sample.b), w = v.flatten(1).roll(1, 1).view_as(v);
+  for (const bool columns : {false, true}) {
+    const auto product = [&](const at::Tensor& of) {  // the loops scale A, which may lose a small row
+      return sample.of(columns ? sample.a.apply_transpose(of) : sample.a.apply(of));
+    };
+    const auto empty = product(v).eq(0).logical_and(product(w).eq(0));
+    const auto count = empty.sum().item<int64_t>();
+    if (count == 0) continue;
+    const char* line = columns ? "column" : "row";
+    const auto first = as_tuple(first_true(empty));
+    return (count == 1 ? c10::str(line, " ", first, " of A is zero")
+                       : c10::str(count, " ", line, "s of A are zero, such as ", first)) +
+           ", as those of a node in no element are; put 1 on the diagonal there, or leave these unknowns out";
+  }
+  return {};
 }
 
 /// A preconditioner of the user's own hands out NaN or Inf.
@@ -269,6 +290,9 @@ std::string nonfinite_operator(const FailedSample& sample) {
 std::string cause_in_operator(const FailedSample& sample, SolveStatus status) {
   const bool broke_down = status == SolveStatus::kBreakdown;
   const bool failed = broke_down || status == SolveStatus::kDiverged;
+  const bool is_refused_input = status == SolveStatus::kNonfiniteInput || status == SolveStatus::kNonfiniteOperator;
+  if (!is_refused_input)
+    if (auto found = empty_line(sample); !found.empty()) return found;
   if (failed)
     if (auto found = undeclared_null_space(sample); !found.empty()) return found;
   if (broke_down)

@@ -163,6 +163,15 @@ bool warn_of_stopped(const Report& report) {
   return true;
 }
 
+/// Whether a sample is far from rtol after as many products as unknowns, in which a Krylov method should have ended.
+bool has_had_enough(const Report& report, int64_t sample, int64_t products) {
+  const auto method = report.role.solver.method;
+  const bool is_krylov = method == Method::kConjugateGradient || method == Method::kBiCGStab ||
+                         method == Method::kGmres || method == Method::kMinres;
+  const int64_t unknowns = report.b.numel() / report.batch();
+  return is_krylov && products >= unknowns && report.residuals[sample] > report.large_residual();
+}
+
 /// Where many products did not lead to rtol, though no residual grew, as A or a preconditioner of one's own is not what
 /// the method is made for. After fewer, the products that tell would cost too much beside the solve.
 void warn_of_unfit(const Report& report, const std::vector<int64_t>& unsolved) {
@@ -175,7 +184,7 @@ void warn_of_unfit(const Report& report, const std::vector<int64_t>& unsolved) {
   const auto products = report.info.operator_applications[worst].item<int64_t>();
   const double bound = 10.0 * std::max(solver.rtol, report.info.floor[worst].item<double>());
   if (static_cast<double>(products) < many_products || !(report.residuals[worst] > bound)) return;
-  if (unfit({report.role, report.a, report.b, worst}).empty()) return;
+  if (!has_had_enough(report, worst, products) && unfit({report.role, report.a, report.b, worst}).empty()) return;
   report.warn("unfit: ", unsolved.size(), worst, SolveStatus::kMaxIter, [&](std::ostream& text) {
     text << "did not reach rtol = " << solver.rtol << ": sample " << worst << " is at relative residual "
          << report.residuals[worst] << " after " << products << " products with A";
