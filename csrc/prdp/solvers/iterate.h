@@ -118,12 +118,15 @@ void accept_if_insensitive(Space& space, const Method& method, typename Space::S
       accept_rounding(states[i]);
 }
 
-/// For direct methods, where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖, and the residual exceeds 1e-2 ‖b‖: if the
-/// rounding of A may move u, A is singular to the dtype, and zero replaces u; else u is as good as the dtype allows,
-/// and its residual is rounding. Any other residual above ‖b‖ is a breakdown.
+/// For direct methods, where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖. If the factors are those of a definite A, u
+/// is as good as the dtype allows, and its residual is rounding. Else, where that exceeds 1e-2 ‖b‖ and the rounding of
+/// A may move u, A is singular to the dtype, and zero replaces u. Any other residual above ‖b‖ is a breakdown.
 template <class Space, class Method>
-void judge_numerical_singularity(Space& space, const Method& method, typename Space::States& states) {
-  const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
+void judge_numerical_singularity(Space& space, const Method& method, typename Space::States& states, bool track) {
+  const auto is_large = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
+  const auto is_doubtful = [&](const SampleState& s) {
+    return is_large(s) || (track && s.status == SolveStatus::kMaxIter);
+  };
   if (!std::none_of(states.begin(), states.end(), is_doubtful)) {  // kernels have no any_of
     const auto floors = rounding_floors(space, method);
     const auto definite = space.definite_factors(method.x);
@@ -132,8 +135,8 @@ void judge_numerical_singularity(Space& space, const Method& method, typename Sp
       auto& s = states[i];
       if (!is_doubtful(s) || !(floors[i] > 0.25 * std::sqrt(s.b2))) continue;
       if (definite[i]) accept_rounding(s);
-      else s.returned = Returned::kZero;
-      asks_for_estimate = asks_for_estimate || !definite[i];
+      else if (is_large(s)) s.returned = Returned::kZero;
+      asks_for_estimate = asks_for_estimate || s.returned == Returned::kZero;
     }
     if (asks_for_estimate) accept_if_insensitive(space, method, states);
   }
@@ -194,7 +197,7 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
     s.returned = may_be_worse && is_above_b(s, space.epsilon()) ? Returned::kBestOrZero : Returned::kLast;
   }
   accept_at_rounding_floor(space, method, states);
-  if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states);
+  if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states, track);
   if constexpr (kDescendsEnergy<Method>) accept_by_energy(space, method, states);
   if constexpr (kMayGrow<Method>)
     if (track) judge_growth(space, method, states);
