@@ -235,7 +235,9 @@ class Stepper(HasSettings):
         if not compiling and _check.dense(who, "u", u).dim() < 2:
             raise ValueError(f"{who}: u must have shape (batch, ...), got {tuple(u.shape)}")
         u = full_precision(u)
-        may_lose = self.on_failure != "raise" and not compiling and u.requires_grad
+        if self.on_failure != "raise" and (compiling or torch_private.transforms_are_active()):
+            return self._solve_from(self._constant_where_refused(u), log)
+        may_lose = self.on_failure != "raise" and u.requires_grad
         if not may_lose or u.is_cpu:
             found = self._solve_from(u, log)
             if not may_lose or not _C.any_nonfinite(_status_of(found)):
@@ -246,6 +248,18 @@ class Stepper(HasSettings):
         found = self._solve_from(state, log)
         _C.block_gradients_of_failed(state, _status_of(found), self.on_failure)
         return found
+
+    def _constant_where_refused(self, u: Tensor) -> Tensor:
+        """The same as block_gradients_of_failed(), for a graph that takes no hook: it knows the samples beforehand, by
+        making A(u) and b(u) once more."""
+        with torch.no_grad():
+            a = as_operator(type(self).__name__, "operator(u)", self.operator(u))
+            refused = self._rhs_with(u, a).isfinite().flatten(1).all(1).logical_not()
+            for t in a.tensors:
+                of_samples = t.dim() > 0 and t.shape[0] == u.shape[0]
+                finite = t.isfinite().flatten(1).all(1) if of_samples and t.dim() > 1 else t.isfinite()
+                refused = refused | (finite if of_samples else finite.all()).logical_not()
+        return torch.where(refused.view(-1, *[1] * (u.dim() - 1)), u.detach(), u)
 
     def _solve_from(self, u: Tensor, log: AdjointLog) -> Solution:
         who, compiling = type(self).__name__, torch.compiler.is_compiling()

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from torch.func import grad, jvp
+from torch.func import functional_call, grad, jvp, vjp
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -128,3 +128,58 @@ def test_a_refused_matrix_with_a_pattern_of_its_own_leaves_its_neighbours_their_
 
     expected = torch.tensor([[-1 / 4, -1 / 9], [0.0, 0.0]], dtype=F64)
     torch.testing.assert_close(grad(loss)(values), expected, rtol=1e-8, atol=0)
+
+
+def by_compile(network, x, loss, steps):
+    torch._dynamo.reset()
+    compiled = torch.compile(lambda x: steps(network(x)), backend="aot_eager", fullgraph=True)
+    return torch.autograd.grad(loss(compiled(x)), network.weight)[0]
+
+
+def of_weights(network, x, loss, steps):
+    weights = {name: p.detach() for name, p in network.named_parameters()}
+    return weights, lambda weights: loss(steps(functional_call(network, weights, (x,))))
+
+
+def by_grad(*of):
+    weights, value = of_weights(*of)
+    return grad(value)(weights)["weight"]
+
+
+def by_vjp(*of):
+    weights, value = of_weights(*of)
+    return vjp(value, weights)[1](torch.ones((), dtype=F64))[0]["weight"]
+
+
+@pytest.mark.parametrize("on_failure", ["zero_grad", "return"])
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize(
+    "way, part",  # a Function cannot be made within a compiled graph
+    [(way, part) for way in (by_compile, by_grad, by_vjp) for part in ("rhs", "operator", "stencil")]
+    + [(by_grad, "function"), (by_vjp, "function")],
+)
+def test_in_a_graph_an_infinite_derivative_of_a_refused_sample_reaches_no_weight(way, count, part, on_failure):
+    """The zero cotangent of the sample, times the derivative of exp(u) = Inf, is NaN in what made its state."""
+    torch.manual_seed(0)
+    network, x = torch.nn.Linear(16, 16).double(), noise(4, 1, 16)
+    x[2] *= 1e5
+    a = {
+        "rhs": operators.Heat((16,), 1e-2, 0.1),
+        "operator": lambda u: operators.Diffusion(torch.exp(u[:, 0]), 1.0),
+        "function": lambda u: operators.Function(lambda v, e: (2 + e) * v, tensors=torch.exp(u), symmetric=True),
+        "stencil": lambda u: operators.Stencil(torch.stack([2 + torch.exp(u[:, 0]), -u[:, 0].tanh()], 1), [(0,), (1,)]),
+    }[part]
+    rhs = (lambda u: u + 0.1 * torch.exp(u)) if part == "rhs" else None
+    step = prdp.ImplicitStep(a, rhs, prdp.GMRES(40, rtol=1e-10), on_failure=on_failure)
+
+    def steps(u):
+        return step.rollout(u, count)[:, 1:]
+
+    def loss(states):
+        weights = torch.tensor([1.0, 1.0, 0.0, 1.0], dtype=F64)[: len(states)] if len(states) == 4 else torch.ones(3)
+        return (states * weights[:, None, None, None]).square().sum()
+
+    found = way(network, x, loss, steps)
+    healthy = x[[0, 1, 3]]
+    expected = torch.autograd.grad(loss(steps(network(healthy))), network.weight)[0]
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-9)
