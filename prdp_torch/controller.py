@@ -78,7 +78,8 @@ class _Attached(_Compiled):
         if converged is None:
             converged = all_converged(self.steppers)
         ended = Ended.of(self.steppers)
-        refined = self._step(*Interval.of_processes(metric, bool(converged), error, ended, self.process_group))
+        agreed = {"max_iter": self.max_iter, "the least metric so far": self._checkpoint, **self.settings}
+        refined = self._step(*Interval.of_processes(metric, bool(converged), error, ended, self.process_group, agreed))
         self._push()
         self._speak(refined)
         return refined
@@ -188,6 +189,7 @@ class PRDPController(_C.PRDPController, _Attached):
 
     - The solves stop so far from the solution that their error dominates what is trained.
     - Most of the last solves took no iteration though their residual is above 1e-4: steps pass their start on.
+    - Most samples of the last solves failed.
     - The metric grows: it was more than twice its least value, three times in a row.
     - The last `step` raised an error for its metric.
 

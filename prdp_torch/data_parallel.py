@@ -44,15 +44,20 @@ def is_first() -> bool:
     return count() == 1 or distributed.get_rank() == 0
 
 
-def sums(values: Iterable[float], group: "distributed.ProcessGroup | None" = None) -> list[float]:
-    """The sums over the processes of each of these numbers, to the same bit in all of them."""
+def gathered(values: Iterable[float], group: "distributed.ProcessGroup | None" = None) -> list[list[float]]:
+    """These numbers of each process, in all of them."""
     if count(group) == 1:
-        return list(values)
+        return [list(values)]
     device = "cuda" if distributed.get_backend(group) == "nccl" else "cpu"
     mine = torch.tensor([float(value) for value in values], dtype=torch.float64, device=device)
     of_all = [torch.empty_like(mine) for _ in range(count(group))]
     distributed.all_gather(of_all, mine, group=group)
-    return [sum(column) for column in zip(*(t.tolist() for t in of_all), strict=True)]
+    return [t.tolist() for t in of_all]
+
+
+def sums(values: Iterable[float], group: "distributed.ProcessGroup | None" = None) -> list[float]:
+    """The sums over the processes of each of these numbers, to the same bit in all of them."""
+    return [sum(column) for column in zip(*gathered(values, group), strict=True)]
 
 
 def mean(values: Iterable[float], samples: int) -> list[float]:

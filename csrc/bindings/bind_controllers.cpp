@@ -37,12 +37,13 @@ void bind_interface(py::module_& m) {
   py::class_<Controller>(m, "Controller")
       .def(
           "_step",
-          [](Controller& c, double metric, bool converged, Known residual, Known error, double idle) {
+          [](Controller& c, double metric, bool converged, Known residual, Known error, double idle, double failed) {
             Solves solves{converged, residual, error};
             solves.idle = idle;
+            solves.failed = failed;
             return c.step(metric, solves);
           },
-          "metric"_a, "converged"_a, "residual"_a, "error"_a, "idle"_a)
+          "metric"_a, "converged"_a, "residual"_a, "error"_a, "idle"_a, "failed"_a)
       .def("_load", &load, "max_iter"_a, "checkpoint"_a, "history"_a)
       .def_property_readonly("max_iter", &Controller::max_iter)
       .def_property_readonly("warning", &Controller::warning)

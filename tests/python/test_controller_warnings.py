@@ -33,9 +33,38 @@ def test_failed_samples_do_not_hide_the_residual_of_the_others():
         heat(u.index_fill(0, torch.arange(failed), float("nan")))
         controller.step(0.01)
         residuals.append(controller.history[-1].residual)
-        warned.append(controller.warning is not None)
+        warned.append("the solves stop at a residual" in controller.warning)
         assert failed == 16 or residuals[-1] == float(heat.info.residual[failed:].mean())
     assert residuals[2] is None and warned == [True, True, False]
+
+
+@pytest.mark.parametrize("failed", [0, 8, 9, 16])
+@pytest.mark.parametrize("make", [prdp.ToleranceController, prdp.PRDPController])
+def test_samples_that_fail_are_told_where_they_are_most(make, failed):
+    heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=99), on_failure="zero_grad")
+    controller = make([heat])
+    controller.step(1.0)
+    heat(field((30,), 16).index_fill(0, torch.arange(failed), float("nan")))
+    controller.step(0.9)
+    told = "most samples of the last solves failed, and what is trained learns nothing" in (controller.warning or "")
+    assert told == (failed > 8)
+    heat(field((30,), 16))
+    controller.step(0.8)
+    assert "failed" not in (controller.warning or "")
+
+
+def test_an_error_in_units_is_told():
+    controller = prdp.ToleranceController()
+    for k in range(20):
+        assert controller.warning is None
+        controller.step(30.0 - k / 10)
+    assert "has been above 1 in each of 20 intervals" in controller.warning and "is it relative" in controller.warning
+    controller.step(0.9)
+    assert controller.warning is None
+    relative = prdp.PRDPController()
+    for k in range(40):
+        relative.step(30.0 - k / 10)
+    assert relative.warning is None  # its metric may have any unit
 
 
 def test_a_tolerance_that_was_asked_for_is_no_warning():

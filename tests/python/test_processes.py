@@ -162,6 +162,24 @@ def test_controllers_refine_in_the_same_interval_on_all_processes(tmp_path):
     assert both == [alone(impatient, row) for row in metrics]
 
 
+def controllers_that_differ(path):
+    rank = distributed.get_rank()
+    controller = prdp.PRDPController(initial=2)
+    if rank == 0:  # as if it were the weights of a network, which one process hands to the others
+        controller.load_state_dict({**controller.state_dict(), "max_iter": 7})
+    for made, what in (
+        (controller, "max_iter is 2 and 7"),
+        (prdp.ToleranceController(ratio=0.1 + 0.1 * rank), "ratio is 0.1 and 0.2"),
+        (prdp.PRDPController(maximum=9 if rank else None), "maximum is None and 9"),
+    ):
+        with pytest.raises(RuntimeError, match=rf"the controllers of 2 processes disagree: {what}; make them with the"):
+            made.step(1.0)
+
+
+def test_controllers_that_differ_between_processes_are_refused_in_all(tmp_path):
+    together(2, tmp_path, controllers_that_differ, tmp_path)
+
+
 def reports_and_refusals(path):
     rank = distributed.get_rank()
     u = torch.randn(5, 1, 30, generator=torch.Generator().manual_seed(0))

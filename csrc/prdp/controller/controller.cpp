@@ -45,6 +45,7 @@ void Controller::check_solves(const Solves& solves) {
   for (const auto& [what, value] : {std::pair("error", solves.error), std::pair("residual", solves.residual)})
     TORCH_CHECK_VALUE(!value || is_size(*value), name(), ": ", what, " must be finite and >= 0, got ", *value);
   idle_ = solves.idle;
+  failed_ = solves.failed;
 }
 
 void Controller::check_state(const State& state, bool is_ignored) const {
@@ -73,6 +74,11 @@ std::string Controller::about_metric() const {
   if (history.size() <= kGrown) return {};
   const auto [least, most] = std::minmax_element(history.begin(), history.end(),
                                                  [](const Record& a, const Record& b) { return a.metric < b.metric; });
+  if (has_relative_metric() && history.size() >= kLong && least->metric > 1.0) {
+    text << "the " << metric_name() << " has been above 1 in each of " << history.size() << " intervals, "
+         << least->metric << " at least: is it relative, ‖u - u_ref‖ / ‖u_ref‖? The tolerance follows what is below 1";
+    return text.str();
+  }
   const bool never_fell = history.size() >= kLong && least == history.begin();
   const double growth = never_fell ? kGrowthFromFirst : kGrowth;
   const double bound = std::max(growth * least->metric, kRoundingOfMetric * most->metric);
@@ -88,6 +94,10 @@ std::string Controller::about_metric() const {
 
 std::string Controller::about_residual() const {
   const auto& history = state().history;
+  if (failed_ > 0.5)
+    return std::string(name()) +
+           ": most samples of the last solves failed, and what is trained learns nothing from them; the status of "
+           "each says why";
   if (idle_ > 0.5)
     return std::string(name()) +
            ": most of the last solves took no iteration, as their start met rtol: what is trained, or a step in time, "

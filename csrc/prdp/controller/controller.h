@@ -20,6 +20,8 @@ struct Solves {
   std::optional<double> error{};
   /// The share of samples whose solve took no iteration, as its start met the tolerance, and is above rounding.
   double idle = 0.0;
+  /// The share of samples that failed.
+  double failed = 0.0;
 
   Solves() = default;
   /// From a bool alone: an error or a residual in its place would pass for true.
@@ -73,7 +75,7 @@ class Controller {
   ///     network gives v, and training makes the solve P_K v meet u₂ = P v_ref. If the loss is small, v - v_ref is the
   ///     residual of that solve. So a residual as large as the error is the error. If the error is not known, a large
   ///     residual counts once the metric has stalled.
-  ///   - Most of the last solves took no iteration, so that steps pass their start on.
+  ///   - Most of the last solves took no iteration, so that steps pass their start on, or failed.
   std::optional<std::string> warning() const;
 
  protected:
@@ -81,13 +83,15 @@ class Controller {
   /// Raises ValueError unless the metric is finite and >= 0. warning() then reports it.
   void check_metric(double metric);
   /// Raises ValueError unless the error and the residual, where they are known, are finite and >= 0. warning() then
-  /// reports solves that did nothing.
+  /// reports solves that did nothing, or failed.
   void check_solves(const Solves& solves);
   /// Raises ValueError for a state that no controller can have reached; a metric that `is_ignored` may be anything.
   void check_state(const State& state, bool is_ignored = false) const;
   virtual const char* name() const = 0;
   /// What messages call the metric.
   virtual const char* metric_name() const { return "metric"; }
+  /// Whether the metric is relative to the size of what is trained for.
+  virtual bool has_relative_metric() const { return false; }
   /// What the user should do about the warning, as the end of a sentence.
   virtual const char* remedy() const = 0;
   /// Whether the metric no longer falls.
@@ -102,7 +106,7 @@ class Controller {
   std::string about_residual() const;
 
   std::optional<double> refused_;  // the metric of the last step(), if it raised an error
-  double idle_ = 0.0;  // of its solves
+  double idle_ = 0.0, failed_ = 0.0;  // of its solves
 };
 
 /// ⌈ratio · K⌉, the iterations of an adjoint solve: at least one where K is. Raises ValueError in the name of `who`

@@ -40,6 +40,7 @@ class ToleranceController final : public Controller {
  private:
   const char* name() const override { return "ToleranceController"; }
   const char* metric_name() const override { return "error"; }
+  bool has_relative_metric() const override { return true; }
   const char* remedy() const override {
     return "raise maximum, or take a solver that needs fewer iterations, as with the preconditioner multigrid, or "
            "float64 if it stalls";
