@@ -45,7 +45,10 @@ void Grid::check_field(const at::Tensor& v, int64_t channels) const {
                       other_fields ? "; fields of several channels are samples: u.flatten(0, 1).unsqueeze(1)" : "");
   }
   TORCH_CHECK_TYPE(v.scalar_type() == at::kFloat || v.scalar_type() == at::kDouble, owner_,
-                   ": expected float32 or float64, got ", v.scalar_type());
+                   ": expected float32 or float64, got ", v.scalar_type(),
+                   at::isReducedFloatingType(v.scalar_type())
+                       ? "; keep the step in float32, and let autocast take the network to less"
+                       : "");
 }
 
 namespace {

@@ -9,7 +9,9 @@ namespace prdp {
 void check_matrix_vector(const at::Tensor& b, const at::Tensor& values, int64_t n, bool batched) {
   TORCH_CHECK_VALUE(b.dim() == 2 && b.size(1) == n, "linear_solve: a matrix of ", n, " rows needs b of shape (", n,
                     ",) or (batch, ", n, "), got ", b.sizes(),
-                    b.dim() == 3 && b.size(2) == n
+                    b.dim() == 3 && b.size(2) == n && !batched
+                        ? "; the right-hand sides of one matrix are samples: b.flatten(0, 1)"
+                    : b.dim() == 3 && b.size(2) == n
                         ? in_language("; for several right-hand sides of a matrix, take torch.func.vmap over them", "")
                     : b.dim() > 2 ? "; flatten b, or make the product a Function"
                                   : "");

@@ -122,7 +122,10 @@ void FlowBox::check_velocity(const at::Tensor& u) const {
   TORCH_CHECK_VALUE(samples_ == 1 || samples_ == u.size(0), "Flow: obstacle holds ", samples_, " samples, u holds ",
                     u.size(0));
   TORCH_CHECK_TYPE(u.scalar_type() == at::kFloat || u.scalar_type() == at::kDouble,
-                   "Flow: u must be float32 or float64, got ", u.scalar_type());
+                   "Flow: u must be float32 or float64, got ", u.scalar_type(),
+                   at::isReducedFloatingType(u.scalar_type())
+                       ? "; keep the step in float32, and let autocast take the network to less"
+                       : "");
 }
 
 const FlowFields& FlowBox::fields(const at::TensorOptions& options) const {
