@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import statuses
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -93,3 +94,18 @@ def test_more_products_than_unknowns_far_from_rtol_are_told(make, always):
         prdp.linear_solve(a, b, make(120))
     prdp.linear_solve(a, b, make(120, rtol=0.0))
     prdp.linear_solve(a, b, make(120), on_failure="return")
+
+
+@pytest.mark.filterwarnings("ignore:.* did not reach rtol", "ignore:.* ended far above rtol")
+@pytest.mark.parametrize("form", [lambda a: a, torch.Tensor.to_sparse_csr], ids=["dense", "csr"])
+@pytest.mark.parametrize("iterations", [20, 100, 1000])
+def test_minres_hands_out_the_least_residual_where_b_cannot_be_met(iterations, form):
+    """Later, u grows along the null vector to 1e16, and the true residual with it."""
+    a = chain(7, n=60)
+    b = -torch.ones(3, 60, dtype=F64)
+    b[1] *= 1e-9
+    b[2, 7] = 0.0  # solvable
+    u, info = prdp.linear_solve(form(a), b, prdp.MINRES(iterations))
+    assert statuses(info) == ["MAX_ITER", "MAX_ITER", "CONVERGED"]
+    assert (info.residual[:2] < 1.01 * 60**-0.5).all() and (u.abs().amax(1) < 30 * b.abs().amax(1)).all()
+    torch.testing.assert_close(info.residual[:2], (b - u @ a).norm(dim=1)[:2] / b.norm(dim=1)[:2])

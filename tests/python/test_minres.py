@@ -184,7 +184,7 @@ def test_many_products_in_vain_name_the_asymmetry_though_no_residual_grew():
         return torch.cat([diffused[0] - 1.1 * real + 0.3 * imaginary, diffused[1] - 1.1 * imaginary - 0.3 * real], 1)
 
     b = noise(2, 2, 12, 12)
-    with pytest.warns(UserWarning, match="2 of 2 samples did not reach rtol .* MINRES on Function: A is not symmetric"):
+    with pytest.warns(UserWarning, match="2 of 2 samples .* MINRES on Function: A is not symmetric"):
         _, info = prdp.linear_solve(operators.Function(product), b, prdp.MINRES(300, 1e-9))
     assert not info.solved.any() and (info.residual < 1).all()
 

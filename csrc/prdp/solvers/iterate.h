@@ -189,12 +189,23 @@ void judge_growth(Space& space, const Method& method, typename Space::States& st
   }
 }
 
+/// Whether the true residual of a method whose residual never grows has grown all the same, far from solved: u has
+/// grown along a null vector, where the recursive residual sees nothing.
+template <class Method, class Space>
+bool has_lost_residual(const Space& space, const SampleState& s) {
+  if constexpr (!kNeverGrows<Method>) return false;
+  else
+    return !space.is_preconditioned() && is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2 &&
+           s.residual2 > 1.1 * s.best2;
+}
+
 /// Which iterate each sample is to hand out; returns whether all hand out their last.
 template <class Space, class Method>
 bool choose_answers(Space& space, Method& method, typename Space::States& states, bool track) {
   for (auto& s : states) {
     const bool may_be_worse = is_unsolved(s.status) || s.status == SolveStatus::kBreakdown;
-    s.returned = may_be_worse && is_above_b(s, space.epsilon()) ? Returned::kBestOrZero : Returned::kLast;
+    const bool is_lost = track && has_lost_residual<Method>(space, s);
+    s.returned = is_lost || (may_be_worse && is_above_b(s, space.epsilon())) ? Returned::kBestOrZero : Returned::kLast;
   }
   accept_at_rounding_floor(space, method, states);
   if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states, track);
@@ -225,18 +236,19 @@ void run_again(Space& space, Method& method, typename Space::States& states, dou
   run(space, method, states, rtol, track);
 }
 
-/// Where the iterate of least recursive residual has a true one above ‖b‖: of those after half as many iterations, a
-/// quarter and so on, takes the one of least true residual, or zero.
+/// Where the iterate of least recursive residual has a true one that is above ‖b‖, or lost: of it and those after half
+/// as many iterations, a quarter and so on, takes the one of least true residual, or zero.
 template <class Space, class Method>
 void take_least_of_halves(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
+  const auto is_lost = [&](const SampleState& s) { return track && has_lost_residual<Method>(space, s); };
   const auto is_worse = [&](const SampleState& s) {
-    return s.returned == Returned::kBestOrZero && is_above_b(s, space.epsilon());
+    return s.returned == Returned::kBestOrZero && (is_lost(s) || is_above_b(s, space.epsilon()));
   };
   if (std::none_of(states.begin(), states.end(), is_worse)) return;
   const auto full_run = states;
-  auto least = states;  // of true residual, so far; at first that of zero
+  auto least = states;  // of true residual, so far; at first that of zero where it is above ‖b‖
   for (auto& s : least) {
-    if (!is_worse(s)) continue;
+    if (!is_worse(s) || s.residual2 < s.b2) continue;
     s.iterations = 0;
     s.residual2 = s.b2;
   }
@@ -248,9 +260,12 @@ void take_least_of_halves(Space& space, Method& method, typename Space::States& 
     goes_on = false;
     for (size_t i = 0; i < states.size(); ++i) {
       if (!is_worse(full_run[i])) continue;
-      const bool is_new_least = states[i].residual2 < least[i].residual2;
+      // Of those that are hardly worse, the first has the smallest u.
+      const double enough2 = (is_lost(full_run[i]) ? 1.02 : 1.0) * least[i].residual2;
+      const bool is_new_least = states[i].residual2 < enough2;
       if (is_new_least) least[i] = states[i];
-      goes_on = goes_on || (states[i].iterations > 1 && (is_new_least || least[i].iterations == 0));
+      const bool may_fall = is_new_least || least[i].iterations == 0 || is_lost(full_run[i]);
+      goes_on = goes_on || (states[i].iterations > 1 && may_fall);
     }
   }
   run_again(space, method, states, rtol, track, [&](size_t i) { return least[i].iterations; });

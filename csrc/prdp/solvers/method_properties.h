@@ -16,6 +16,10 @@ inline constexpr bool kTakesStrides = requires(Method& m, int64_t n) { m.step(n)
 template <class Method>
 inline constexpr bool kOscillates = requires { Method::kOscillates; };
 
+/// Methods whose residual never grows without a preconditioner, but for rounding.
+template <class Method>
+inline constexpr bool kNeverGrows = requires { Method::kNeverGrows; };
+
 /// Methods that update their residual by a recursion, and go on from the true one once it is recomputed.
 template <class Method>
 inline constexpr bool kHasRecursiveResidual = requires { Method::kHasRecursiveResidual; };

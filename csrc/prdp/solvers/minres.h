@@ -23,6 +23,7 @@ class MinresMethod {
   using Scalar = typename Space::Scalar;
   using Vector = typename Space::Vector;
   static constexpr bool kHasRecursiveResidual = true;
+  static constexpr bool kNeverGrows = true;
 
   explicit MinresMethod(Space& space)
       : x(space.vector()),

@@ -165,9 +165,7 @@ bool warn_of_stopped(const Report& report) {
 
 /// Whether a sample is far from rtol after as many products as unknowns, in which a Krylov method should have ended.
 bool has_had_enough(const Report& report, int64_t sample, int64_t products) {
-  const auto method = report.role.solver.method;
-  const bool is_krylov = method == Method::kConjugateGradient || method == Method::kBiCGStab ||
-                         method == Method::kGmres || method == Method::kMinres;
+  const bool is_krylov = traits(report.role.solver.method).takes_preconditioner;
   const int64_t unknowns = report.b.numel() / report.batch();
   return is_krylov && products >= unknowns && report.residuals[sample] > report.large_residual();
 }
