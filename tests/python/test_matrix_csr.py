@@ -7,7 +7,7 @@ import torch
 from helpers import modes
 
 import prdp_torch as prdp
-from prdp_torch import operators
+from prdp_torch import _C, operators
 
 N = 6
 CROW = torch.tensor([0, 2, 5, 8, 11, 14, 16])
@@ -159,3 +159,30 @@ def test_a_matrix_without_entries_and_one_without_memory_are_looked_at_as_well()
     pattern = torch.tensor([0, 2, 4], device="meta"), torch.tensor([1, 0, 1, 0], device="meta")
     on_meta = torch.sparse_csr_tensor(*pattern, torch.ones(4, device="meta", requires_grad=True), (2, 2))
     assert operators.Matrix(on_meta).kind == "csr"
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("form", ["one matrix", "values of each", "pattern of each"])
+@pytest.mark.parametrize("batch, n", [(1, 1), (3, 17), (9, 700)])
+def test_the_gradient_of_the_values_is_the_outer_product_at_their_places(form, batch, n, dtype, threads):
+    generator = torch.Generator().manual_seed(n)
+    patterns = (torch.rand(1 if form != "pattern of each" else batch, n, n, generator=generator) < 4 / n).to(dtype)
+    count = int(patterns.sum((1, 2)).min()) if len(patterns) > 1 else None
+    entries = [p.nonzero()[:count] for p in patterns]
+    crow = torch.stack([torch.searchsorted(e[:, 0].contiguous(), torch.arange(n + 1)) for e in entries])
+    col = torch.stack([e[:, 1] for e in entries])
+    values = torch.rand(*(() if form == "one matrix" else (batch,)), col.shape[1], generator=generator, dtype=dtype)
+    lam, u = (torch.rand(batch, n, generator=generator, dtype=dtype) for _ in range(2))
+    if len(patterns) == 1:
+        crow, col = crow[0], col[0]
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with torch.no_grad():
+            found = _C.product_rule(lam, u, [crow, col, values], "csr", [], [])[2]
+    finally:
+        torch.set_num_threads(before)
+    outer = [lam[s, e[:, 0]] * u[s, e[:, 1]] for s in range(batch) for e in [entries[s % len(entries)]]]
+    expected = sum(outer) if form == "one matrix" else torch.stack(outer)
+    torch.testing.assert_close(found, expected, rtol=1e-6 if dtype == torch.float32 else 1e-14, atol=0.0)

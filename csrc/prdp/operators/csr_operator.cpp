@@ -11,6 +11,7 @@
 #include "prdp/operators/matrix_checks.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/product_rule_kernels.h"
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -176,6 +177,29 @@ at::Tensor product_rule_by_kernel(const at::Tensor& lambda, const at::Tensor& u,
   return gpu::each_point(out.device(), product_rule_body<T>("CsrProductRule"), of, out.numel()) ? out : at::Tensor();
 }
 
+/// The same in the host's memory: λ_i u_j of each sample, at the entries of its matrix or summed at those of all.
+template <class T>
+at::Tensor product_rule_by_loops(const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& crow,
+                                 const at::Tensor& col, const at::Tensor& values) {
+  auto out = at::zeros(values.sizes(), values.options());
+  const int64_t batch = u.size(0), n = u.size(1), stored = values.size(-1), own = values.dim() == 2;
+  const int64_t rows_step = step(crow), columns_step = step(col);
+  const auto *left = lambda.const_data_ptr<T>(), *right = u.const_data_ptr<T>();
+  const auto *rows = crow.const_data_ptr<int64_t>(), *columns = col.const_data_ptr<int64_t>();
+  T* const to = out.mutable_data_ptr<T>();
+  constexpr int64_t worthwhile = int64_t{1} << 18;  // entries for a thread
+  const int64_t grain = std::max<int64_t>(1, worthwhile * n / std::max<int64_t>(1, stored * batch));
+  interruption::parallel_for(0, n, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t s = 0; s < batch; ++s)
+      for (int64_t i = begin; i < end; ++i) {
+        const auto *ends = rows + s * rows_step + i, *column = columns + s * columns_step;
+        const T of_row = left[s * n + i];
+        for (int64_t k = ends[0]; k < ends[1]; ++k) to[own * s * stored + k] += of_row * right[s * n + column[k]];
+      }
+  });
+  return out;
+}
+
 }  // namespace
 
 std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
@@ -186,6 +210,13 @@ std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda, cons
     if (all.defined()) return {at::Tensor(), at::Tensor(), had_axis_of_one_ ? all.unsqueeze(0) : all};
   }
   // ∂⟨λ, A u⟩/∂A_ij = λ_i u_j at the stored entries, summed over the samples that share A
+  const bool is_plain_product = is_plain(lambda) && is_plain(u) && all_plain({crow_, col_, values_});
+  if (u.is_cpu() && is_plain_product && !at::GradMode::is_enabled() && !in_torch_func() &&
+      lambda.sizes() == u.sizes()) {
+    const auto by_loops = u.scalar_type() == at::kFloat ? product_rule_by_loops<float> : product_rule_by_loops<double>;
+    const auto all = by_loops(lambda.contiguous(), u.contiguous(), shared_or_own(crow_), shared_or_own(col_), values_);
+    return {at::Tensor(), at::Tensor(), had_axis_of_one_ ? all.unsqueeze(0) : all};
+  }
   const auto col = col_.expand({u.size(0), -1});
   const auto row = rows().expand({u.size(0), -1});
   const auto outer = lambda.gather(1, row) * u.gather(1, col);
