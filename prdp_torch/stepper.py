@@ -14,10 +14,12 @@ from prdp_torch.batching import outlive_transforms
 from prdp_torch.calls import forgets_if_it_raises
 from prdp_torch.operators.base import full_precision
 from prdp_torch.operators.matrix import as_operator
-from prdp_torch.solve import AdjointLog, AdjointLogs, LogOfRollout, SolveInfo
-from prdp_torch.solvers import Solver
+from prdp_torch.solve import AdjointLog, AdjointLogs, LogOfRollout, SolveInfo, SolveStatus, linear_solve
+from prdp_torch.solvers import GMRES, Solver
 from prdp_torch.stepper_settings import HasSettings
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Report, Solution, Start
+
+_REFUSED = int(SolveStatus.NONFINITE_INPUT)  # this, or less: before the first iteration
 
 
 @dataclass
@@ -235,9 +237,10 @@ class Stepper(HasSettings):
         if not compiling and _check.dense(who, "u", u).dim() < 2:
             raise ValueError(f"{who}: u must have shape (batch, ...), got {tuple(u.shape)}")
         u = full_precision(u)
-        if self.on_failure != "raise" and (compiling or torch_private.transforms_are_active()):
+        in_graph = (compiling and u.requires_grad) or (not compiling and torch_private.transforms_are_active())
+        if self.on_failure != "raise" and in_graph:
             return self._solve_from(self._constant_where_refused(u), log)
-        may_lose = self.on_failure != "raise" and u.requires_grad
+        may_lose = self.on_failure != "raise" and not compiling and u.requires_grad
         if not may_lose or u.is_cpu:
             found = self._solve_from(u, log)
             if not may_lose or not _C.any_nonfinite(_status_of(found)):
@@ -251,14 +254,12 @@ class Stepper(HasSettings):
 
     def _constant_where_refused(self, u: Tensor) -> Tensor:
         """The same as block_gradients_of_failed(), for a graph that takes no hook: it knows the samples beforehand, by
-        making A(u) and b(u) once more."""
+        making A(u) and b(u) once more, for a solve without iterations."""
         with torch.no_grad():
             a = as_operator(type(self).__name__, "operator(u)", self.operator(u))
-            refused = self._rhs_with(u, a).isfinite().flatten(1).all(1).logical_not()
-            for t in a.tensors:
-                of_samples = t.dim() > 0 and t.shape[0] == u.shape[0]
-                finite = t.isfinite().flatten(1).all(1) if of_samples and t.dim() > 1 else t.isfinite()
-                refused = refused | (finite if of_samples else finite.all()).logical_not()
+            b = self._rhs_with(u, a)
+            _, info = linear_solve(a, b, GMRES(0), backward="none", on_failure="return")
+            refused = info.status <= _REFUSED
         return torch.where(refused.view(-1, *[1] * (u.dim() - 1)), u.detach(), u)
 
     def _solve_from(self, u: Tensor, log: AdjointLog) -> Solution:

@@ -58,7 +58,10 @@ def test_an_error_in_units_is_told():
     for k in range(20):
         assert controller.warning is None
         controller.step(30.0 - k / 10)
-    assert "has been above 1 in each of 20 intervals" in controller.warning and "is it relative" in controller.warning
+    assert "the error was 2.8e+01 at least in 20 intervals: is it relative" in controller.warning
+    for k in range(3):
+        controller.step(90.0 + k)
+    assert "the error grows" in controller.warning and "relative" not in controller.warning
     controller.step(0.9)
     assert controller.warning is None
     relative = prdp.PRDPController()

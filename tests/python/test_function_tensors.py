@@ -3,6 +3,7 @@
 import pytest
 import torch
 from helpers import statuses
+from torch.autograd import forward_ad
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -88,6 +89,50 @@ def test_a_tensor_that_no_derivative_reaches_is_named(backward, always):
         prdp.linear_solve(a, b, prdp.CG(60), backward=backward)
     fixed = operators.Function(hessian_product(create_graph=False), tensors=(x, k.detach(), m), symmetric=True)
     prdp.linear_solve(fixed, b, prdp.CG(60), backward=backward)
+
+
+@pytest.mark.parametrize("grad_mode", [True, False])
+@pytest.mark.parametrize("solver", [prdp.CG(60, rtol=1e-13), prdp.GMRES(6, restart=9, rtol=1e-13), prdp.Direct()])
+def test_such_a_product_has_tangents(solver, grad_mode):
+    x, k, m, b = springs()
+    k, m, dk = k.detach(), m.detach(), torch.linspace(-1, 1, len(k), dtype=torch.float64)
+    product = hessian_product(create_graph=True)
+
+    def solve(k):
+        return prdp.linear_solve(operators.Function(product, tensors=(x, k, m), symmetric=True), b, solver)[0]
+
+    with torch.set_grad_enabled(grad_mode), forward_ad.dual_level():
+        tangent = forward_ad.unpack_dual(solve(forward_ad.make_dual(k, dk))).tangent
+    differences = (solve(k + 1e-6 * dk) - solve(k - 1e-6 * dk)) / 2e-6
+    torch.testing.assert_close(tangent, differences, rtol=1e-6, atol=1e-8)
+
+
+def test_a_tensor_that_changes_nothing_is_not_named(always):
+    """The last bias of an energy is in no Hessian, and a diagonal may have tensors of its own."""
+    net = torch.nn.Sequential(torch.nn.Linear(9, 5), torch.nn.Softplus(), torch.nn.Linear(5, 1)).double()
+    x, _, m, b = springs()
+    names = [name for name, _ in net.named_parameters()]
+
+    def matvec(v, x, m, *weights):
+        def energy(y):
+            return torch.func.functional_call(net, dict(zip(names, weights, strict=True)), (y,)).sum()
+
+        return 9 * v + torch.func.vjp(torch.func.grad(energy), x)[1](v)[0]
+
+    tensors = (x, m, *net.parameters())
+    a = operators.Function(matvec, tensors=tensors, symmetric=True, diagonal=lambda x, m, *weights: 9 + 0 * m)
+    u, _ = prdp.linear_solve(a, b, prdp.CG(60, preconditioner="diagonal"))
+    u.sum().backward()
+    assert net[0].weight.grad.any() and net[2].bias.grad is None
+
+
+def test_a_product_that_torch_cannot_record_solves_without_a_word(always):
+    _, _, m, b = springs()
+    by_numpy = operators.Function(lambda v, m: torch.from_numpy(v.numpy() * m.numpy()), tensors=m, symmetric=True)
+    u, _ = prdp.linear_solve(by_numpy, b, prdp.CG(60))
+    torch.testing.assert_close(u, b / m, rtol=1e-4, atol=1e-5)
+    with pytest.raises(TypeError, match="Function: expected a vector in float32 or float64"):
+        prdp.linear_solve(by_numpy, b.long(), prdp.CG(60))
 
 
 def test_what_is_captured_beside_a_leaf_of_the_product_is_refused():

@@ -155,17 +155,19 @@ def by_vjp(*of):
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize(
     "way, part",  # a Function cannot be made within a compiled graph
-    [(way, part) for way in (by_compile, by_grad, by_vjp) for part in ("rhs", "operator", "stencil")]
+    [(way, part) for way in (by_compile, by_grad, by_vjp) for part in ("rhs", "operator", "stencil", "root")]
     + [(by_grad, "function"), (by_vjp, "function")],
 )
 def test_in_a_graph_an_infinite_derivative_of_a_refused_sample_reaches_no_weight(way, count, part, on_failure):
     """The zero cotangent of the sample, times the derivative of exp(u) = Inf, is NaN in what made its state."""
     torch.manual_seed(0)
     network, x = torch.nn.Linear(16, 16).double(), noise(4, 1, 16)
-    x[2] *= 1e5
+    x[2] *= 0.0 if part == "root" else 1e5
+    network.bias.data.zero_()
     a = {
         "rhs": operators.Heat((16,), 1e-2, 0.1),
         "operator": lambda u: operators.Diffusion(torch.exp(u[:, 0]), 1.0),
+        "root": lambda u: operators.Diffusion(u[:, 0].abs().sqrt(), 1.0),  # refused where κ = 0
         "function": lambda u: operators.Function(lambda v, e: (2 + e) * v, tensors=torch.exp(u), symmetric=True),
         "stencil": lambda u: operators.Stencil(torch.stack([2 + torch.exp(u[:, 0]), -u[:, 0].tanh()], 1), [(0,), (1,)]),
     }[part]

@@ -188,6 +188,24 @@ def test_an_adjoint_solve_speaks_of_the_gradient(always):
     assert "its solution, which the gradient is made of, is off by" in text and "smaller adjoint_rtol, such as" in text
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_a_null_vector_that_nobody_named_is_no_error(dtype, always):
+    """The stationary density of a chain, along which the rounding of A alone decides."""
+    n, generator = 300, torch.Generator().manual_seed(0)
+    k = torch.exp(1.5 * torch.randn(n - 1, generator=generator, dtype=F64))
+    a = torch.zeros(n, n, dtype=F64)
+    i = torch.arange(n - 1)
+    a[i, i] += k + 3.0
+    a[i, i + 1] -= k
+    a[i + 1, i + 1] += k
+    a[i + 1, i] -= k + 3.0
+    b = (a @ torch.randn(n, 1, generator=generator, dtype=F64)).T
+    (_, info), said = warnings_of(
+        lambda: prdp.linear_solve(a.to(dtype), b.to(dtype), prdp.GMRES(20, rtol=1e-4, restart=300))
+    )
+    assert info.solved.all() and not said
+
+
 @pytest.mark.parametrize("start", [False, True])
 @pytest.mark.parametrize("solver", [prdp.CG(500), prdp.CG(50, preconditioner="multigrid")], ids=repr)
 def test_a_small_channel_beside_a_large_one_is_said(solver, start, always):

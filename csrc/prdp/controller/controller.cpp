@@ -20,6 +20,8 @@ constexpr double kLargeResidual = 0.1;
 /// rounding, next to the largest. One that was never below its first value in `kLong` calls may be an accuracy: there
 /// less growth tells.
 constexpr size_t kGrown = 3, kLong = 20;
+/// Larger than what a relative error is for long.
+constexpr double kNoRelativeError = 5.0;
 constexpr double kGrowth = 2.0, kGrowthFromFirst = 1.1, kRoundingOfMetric = 1e-3;
 
 bool is_size(double x) { return std::isfinite(x) && x >= 0.0; }
@@ -74,16 +76,16 @@ std::string Controller::about_metric() const {
   if (history.size() <= kGrown) return {};
   const auto [least, most] = std::minmax_element(history.begin(), history.end(),
                                                  [](const Record& a, const Record& b) { return a.metric < b.metric; });
-  if (has_relative_metric() && history.size() >= kLong && least->metric > 1.0) {
-    text << "the " << metric_name() << " has been above 1 in each of " << history.size() << " intervals, "
-         << least->metric << " at least: is it relative, ‖u - u_ref‖ / ‖u_ref‖? The tolerance follows what is below 1";
-    return text.str();
-  }
   const bool never_fell = history.size() >= kLong && least == history.begin();
   const double growth = never_fell ? kGrowthFromFirst : kGrowth;
   const double bound = std::max(growth * least->metric, kRoundingOfMetric * most->metric);
   const bool grows =
       std::all_of(history.end() - kGrown, history.end(), [&](const Record& r) { return r.metric > bound; });
+  if (!grows && has_relative_metric() && history.size() >= kLong && least->metric > kNoRelativeError) {
+    text << "the " << metric_name() << " was " << least->metric << " at least in " << history.size()
+         << " intervals: is it relative, ‖u - u_ref‖ / ‖u_ref‖? The tolerance follows what is below 1";
+    return text.str();
+  }
   if (!grows) return {};
   text << "the " << metric_name() << " grows: " << history.back().metric << " after " << least->metric
        << " in interval " << least - history.begin()

@@ -138,7 +138,8 @@ at::Tensor FunctionOperator::apply(const at::Tensor& v) const {
   if (registered_->looks_for_captures && !at::GradMode::is_enabled()) return product_checking_captures(v);
   const auto result = product(registered_->products().apply, v, tensors_, product_name());
   // A derivative that the product takes itself leaves its graph on it.
-  return at::GradMode::is_enabled() || !result.requires_grad() ? result : result.detach();
+  const bool has_graph = !at::GradMode::is_enabled() && result.requires_grad() && !has_tangent(result);
+  return has_graph ? result.detach() : result;
 }
 
 at::Tensor FunctionOperator::apply_transpose(const at::Tensor& v) const {

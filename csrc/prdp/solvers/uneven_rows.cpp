@@ -9,6 +9,7 @@
 #include "prdp/error_text.h"
 #include "prdp/gpu/runtime.h"
 #include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/probes.h"
 #include "prdp/operators/tensors.h"
@@ -43,10 +44,13 @@ at::Tensor shares_of_error(const at::Tensor& rows, const at::Tensor& b, const at
   return at::where(tells, left / (rows * size), 0.0);
 }
 
-/// How much larger the largest row is than the least that is not zero.
+/// How much larger the largest row of a sample is than its small ones, of those that are not zero; the largest of all
+/// samples. A thousandth of the rows is left out: estimates of so many are too small for some.
 double spread_of(const at::Tensor& rows) {
-  const auto there = rows.masked_select(rows > 0);
-  return there.numel() == 0 ? 1.0 : (there.max() / there.min()).item<double>();
+  const auto of_samples = rows.flatten(1);
+  const auto there = of_samples.masked_fill(of_samples.le(0), std::numeric_limits<double>::infinity());
+  const auto small = std::get<0>(there.kthvalue(1 + of_samples.size(1) / 1000, 1));
+  return at::where(small.isinf(), 1.0, of_samples.amax(1) / small).max().item<double>();
 }
 
 /// Rows of these differ at the boundary alone: there is no need to look.
@@ -90,21 +94,41 @@ void warn_of_small_channels(const Look& look) {
   });
 }
 
+/// A of `spec` in float64, each of its numbers changed by the share `rounding` at most.
+OperatorSpec in_double(OperatorSpec spec, double rounding) {
+  for (auto& t : spec.tensors) {
+    if (!at::isFloatingType(t.scalar_type())) continue;
+    t = t.to(at::kDouble);
+    if (rounding > 0.0) t = t * (1.0 + rounding * unstructured_like(t.unsqueeze(0)).squeeze(0));
+  }
+  return spec;
+}
+
 /// How far u changes, as a share of its largest entry, when the solve goes on in float64 to a much smaller residual,
-/// for no more than about twice as many iterations. Along a constant that A maps to rounding, u may change at will.
+/// for no more than about twice as many products. Where the rounding of A itself moves u as far, as along a null vector
+/// that nobody named, that says nothing: 0.
 at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const SolveInfo& info) {
   constexpr double less = 1e-4, least = 1e-13;
-  auto spec = look.role.a;
-  for (auto& t : spec.tensors)
-    if (at::isFloatingType(t.scalar_type())) t = t.to(at::kDouble);
   auto solver = look.role.solver;
   solver.rtol = std::max(less * solver.rtol, least);
-  solver.max_iter = 2 * info.iterations.max().item<int64_t>() + 100;
-  const auto u = look.u.to(at::kDouble);
-  const auto further = solve(*make_operator(spec), look.b.to(at::kDouble), {.solver = solver, .x0 = u}).u;
-  const auto changes = (further - u).abs() / per_sample(sample_maxima(u), u);
-  const auto is_singular = maps_constant_to_zero(a, look.b, /*transposed=*/false, /*jointly=*/true);
-  return changes.masked_fill(per_sample(is_singular, u), 0.0).nan_to_num(0.0, 0.0, 0.0);
+  const int64_t products = 2 * info.operator_applications.max().item<int64_t>() + 20;
+  const auto& method = traits(solver.method);
+  const int64_t each = method.counts == Counts::kCycles ? solver.restart : method.products;
+  solver.max_iter = (products + each - 1) / each;
+  const auto b = look.b.to(at::kDouble), u = look.u.to(at::kDouble), size = per_sample(sample_maxima(u), u);
+  const auto share_of = [&](const at::Tensor& v) { return ((v - u).abs() / size).nan_to_num(0.0, 0.0, 0.0); };
+  const auto go_on = [&](double rounding) {
+    return solve(*make_operator(in_double(look.role.a, rounding)), b, {.solver = solver, .x0 = u}).u;
+  };
+  const auto further = go_on(0.0);
+  auto changes = share_of(further);
+  if (!(changes.max() > look.much()).item<bool>()) return changes;
+  auto is_free = maps_constant_to_zero(a, look.b, /*transposed=*/false, /*jointly=*/true);
+  if (!is_singular(look.role.a)) {
+    const auto moved = share_of(go_on(epsilon_of(look.b)) - further + u);
+    is_free = is_free.logical_or(sample_maxima(moved) > 0.3 * sample_maxima(changes));
+  }
+  return changes.masked_fill(per_sample(is_free, u), 0.0);
 }
 
 void warn_of_small_rows(const Look& look, const Operator& a, const SolveInfo& info) {
@@ -152,9 +176,10 @@ void warn_of_uneven_rows(const SolveRole& role, const Operator& a, const at::Ten
   const at::NoGradGuard no_grad;
   const auto& status = result.info.status;
   const auto is = [&](SolveStatus of) { return status.eq(static_cast<int64_t>(of)); };
+  const auto converged = is(SolveStatus::kConverged).logical_or(is(SolveStatus::kConvergedBreakdown));
+  if (!converged.any().item<bool>()) return;
   const auto residual = a.project(b - apply_on_loops(a, result.u, /*transposed=*/false));
-  const Look look{role, b, result.u, residual,
-                  is(SolveStatus::kConverged).logical_or(is(SolveStatus::kConvergedBreakdown))};
+  const Look look{role, b, result.u, residual, converged};
   if (looks_at_channels) warn_of_small_channels(look);
   if (looks_at_rows) warn_of_small_rows(look, a, result.info);
 }
