@@ -188,8 +188,7 @@ class PRDPController(_C.PRDPController, _Attached):
     `UserWarning`, once, if it lasts five intervals without a refinement, or thirty with some:
 
     - The solves stop so far from the solution that their error dominates what is trained.
-    - Most of the last solves took no iteration though their residual is above 1e-4: steps pass their start on.
-    - Most samples of the last solves failed.
+    - Most of the last solves failed, or took no iteration though their residual is above 1e-4.
     - The metric grows: it was more than twice its least value, three times in a row.
     - The last `step` raised an error for its metric.
 
