@@ -132,6 +132,8 @@ def test_failures_of_an_own_preconditioner_are_not_blamed_on_a():
 
 def test_what_is_singular_to_float32_is_sent_to_float64():
     with pytest.raises(torch.linalg.LinAlgError, match="singular to float32, or nearly so; take float64"):
+        prdp.linear_solve(torch.tensor([[1.0, 2.0], [2.0, 4.0]]), torch.ones(2), prdp.Direct())
+    with pytest.raises(torch.linalg.LinAlgError, match=r"row \(1,\) of A is zero.* has lost them, take float64"):
         prdp.linear_solve(torch.diag(torch.tensor([1.0, 0.0, 2.0])), torch.ones(3), prdp.Direct())
 
 

@@ -79,7 +79,8 @@ std::string empty_line(const FailedSample& sample) try {
     const auto first = as_tuple(first_true(empty));
     return (count == 1 ? c10::str(line, " ", first, " of A is zero")
                        : c10::str(count, " ", line, "s of A are zero, such as ", first)) +
-           ", as those of a node in no element are; put 1 on the diagonal there, or leave these unknowns out";
+           ", as those of a node in no element are; put 1 on the diagonal there, or leave these unknowns out" +
+           (sample.is_single() ? "; where float32 has lost them, take float64" : "");
   }
   return {};
 } catch (const std::exception&) {  // a function without a transpose has nothing to add to a message
@@ -216,14 +217,20 @@ std::string breakdown(const FailedSample& sample) {
       remedy, " a b without that part");
 }
 
+/// Whether the residual of u is its rounding for long, where κ jumps or little holds u.
+bool is_diffusion_in_single(const FailedSample& sample) {
+  return sample.is_single() && sample.is_diffusion() && sample.solver().method == Method::kConjugateGradient;
+}
+constexpr const char* kMayBeRight =
+    "the residual falls no further in float32; where κ jumps or little holds u, u may be right all the same: solve it "
+    "once in float64 to see, and if it is, stay there";
+
 /// Why the residual fell no further, far above what was asked for.
 std::string stagnated(const FailedSample& sample) {
   if (auto found = unfit(sample); !found.empty()) return found;
   const bool single = sample.is_single(), multigrid = sample.preconditioner().is_multigrid();
   const auto method = sample.solver().method;
-  if (single && sample.is_diffusion() && method == Method::kConjugateGradient)
-    return "the residual falls no further in float32; where κ jumps or little holds u, u may be right all the same: "
-           "solve it once in float64 to see, and if it is, stay there";
+  if (is_diffusion_in_single(sample)) return kMayBeRight;
   if (sample.method().counts == Counts::kCycles)
     return c10::str("its cycles take nothing more off the residual; take a larger restart, ",
                     multigrid ? "no multigrid" : "a preconditioner", ", or Direct", single ? ", or float64" : "",
@@ -241,6 +248,8 @@ std::string max_iter_reached(const FailedSample& sample) {
   if (auto found = unfit(sample); !found.empty()) return found;
   const bool single = sample.is_single();
   if (loses_coarse_grids(sample)) return kLostCoarseGrids;
+  if (is_diffusion_in_single(sample) && !sample.preconditioner().is_multigrid())
+    return c10::str("more iterations may help, or ", kMayBeRight);
   if (sample.preconditioner().is_multigrid() && asymmetric(sample).empty())
     return "its cycles are slow where coefficients jump from cell to cell; take more iterations, \"diagonal\" or "
            "Direct";
