@@ -201,8 +201,7 @@ template <int Count>
 void SparseFactors::solve_block(Block<Count> x, const Eigen::VectorXi& to_take, const Eigen::VectorXi& to_give) const {
   const auto& cholesky = *factorised_->cholesky;
   const auto& place = cholesky.permutationP().indices();
-  static thread_local std::vector<double> side_by_side;
-  side_by_side.resize(place.size() * Count);
+  std::vector<double> side_by_side(place.size() * Count);
   double* const memory = side_by_side.data();
   for (int64_t i = 0; i < x.rows(); ++i) {
     if (to_take[i] < 0) continue;
