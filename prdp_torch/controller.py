@@ -78,7 +78,7 @@ class _Attached(_Compiled):
         if converged is None:
             converged = all_converged(self.steppers)
         ended = Ended.of(self.steppers)
-        agreed = {"max_iter": self.max_iter, "the least metric so far": self._checkpoint, **self.settings}
+        agreed = {"max_iter": self.max_iter, "checkpoint": self._checkpoint, **self.settings}
         refined = self._step(*Interval.of_processes(metric, bool(converged), error, ended, self.process_group, agreed))
         self._push()
         self._speak(refined)

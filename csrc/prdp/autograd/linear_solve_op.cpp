@@ -122,8 +122,9 @@ SolveOutputs solve_with_node(const at::Tensor& b, const OperatorSpec& a, const S
   const auto node = reverse ? make_node<SolveNode>(b, a, options) : nullptr;
   const auto out = call_op_below_autograd(b, a, node ? node->options() : options, x0);
   const auto& [u, iterations, residual, status, applications, floor] = out;
-  const bool is_plain_function = is_function(a) && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
-  if (reverse && is_plain_function && any_requires_grad(a.tensors)) warn_of_unreached_tensors(a, b);
+  if (reverse && is_function(a) && is_plain(b) && all_plain(a.tensors) && !in_torch_func() &&
+      any_requires_grad(a.tensors))
+    warn_of_unreached_tensors(a, b);
   const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};  // a start is a constant
   if (reverse) torch::autograd::set_history(u, node);
   if (forward) u._set_fw_grad(solve_jvp(b, solved, a, options), /*level=*/0, /*is_inplace_op=*/false);

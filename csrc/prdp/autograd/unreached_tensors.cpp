@@ -15,12 +15,11 @@ namespace prdp {
 
 namespace {
 
-/// Whether A v depends on the tensor with this index.
-bool changes_product(const OperatorSpec& a, const at::Tensor& v, size_t index) {
+/// Whether A v, which is `before`, depends on the tensor with this index.
+bool changes_product(const OperatorSpec& a, const at::Tensor& v, const at::Tensor& before, size_t index) {
   const at::NoGradGuard no_grad;
   auto other = a;
-  for (auto& t : other.tensors) t = t.detach();
-  const auto before = make_operator(other)->apply(v);
+  other.tensors = detached(a.tensors);
   auto& t = other.tensors[index];
   t = t + 0.01 * (t.abs() + 1.0) * at::ones_like(t).cumsum(-1).sin();
   const auto change = make_operator(other)->apply(v) - before;
@@ -37,7 +36,9 @@ void look(const OperatorSpec& a, const at::Tensor& b) {
   for (size_t i = 0; i < recorded.tensors.size(); ++i) {
     const auto& t = recorded.tensors[i];
     const bool is_out_of_reach = t.requires_grad() && !leaves.contains(t.unsafeGetTensorImpl());
-    if (!is_out_of_reach || !at::isFloatingType(t.scalar_type()) || !changes_product(a, b.detach(), i)) continue;
+    if (!is_out_of_reach || !at::isFloatingType(t.scalar_type()) ||
+        !changes_product(a, b.detach(), product.detach(), i))
+      continue;
     std::ostringstream key;
     key << "unreached tensor " << products->code.get() << ' ' << i;
     warn_once(key.str(), 0.0, [&](std::ostream& text) {

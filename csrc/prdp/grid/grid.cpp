@@ -7,6 +7,11 @@
 
 namespace prdp {
 
+const char* hint_of_dtype(at::ScalarType dtype) {
+  return at::isReducedFloatingType(dtype) ? "; keep the step in float32, and let autocast take the network to less"
+                                          : "";
+}
+
 Grid::Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary, std::vector<double> lengths)
     : owner_(owner), shape_(std::move(shape)), boundary_(boundary), lengths_(std::move(lengths)) {
   TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3, owner_, ": shape must have 1, 2 or 3 extents, got ",
@@ -45,10 +50,7 @@ void Grid::check_field(const at::Tensor& v, int64_t channels) const {
                       other_fields ? "; fields of several channels are samples: u.flatten(0, 1).unsqueeze(1)" : "");
   }
   TORCH_CHECK_TYPE(v.scalar_type() == at::kFloat || v.scalar_type() == at::kDouble, owner_,
-                   ": expected float32 or float64, got ", v.scalar_type(),
-                   at::isReducedFloatingType(v.scalar_type())
-                       ? "; keep the step in float32, and let autocast take the network to less"
-                       : "");
+                   ": expected float32 or float64, got ", v.scalar_type(), hint_of_dtype(v.scalar_type()));
 }
 
 namespace {

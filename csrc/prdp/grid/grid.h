@@ -12,6 +12,9 @@ enum class Boundary {
   kPeriodic,   // those from the other end; dx = length/N
 };
 
+/// What errors about the dtype of a state add for one of less than float32: the remedy.
+const char* hint_of_dtype(at::ScalarType dtype);
+
 /// A uniform grid on an interval, a rectangle or a box. `shape` counts the unknowns in tensor order, (N,), (Ny, Nx) or
 /// (Nz, Ny, Nx): the x direction is the last axis. `lengths` are the sides of the domain in the same order; without
 /// them all sides are 1. Functions of a field and a grid take the last dim() axes of the tensor for the grid, and count

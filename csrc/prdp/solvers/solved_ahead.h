@@ -1,7 +1,7 @@
 #pragma once
 #include <algorithm>
+#include <array>
 #include <cmath>
-#include <vector>
 
 #include "prdp/kernels/vector.h"
 #include "prdp/solvers/solve_samples.h"

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <limits>
 
+#include "prdp/grid/grid.h"
 #include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/steppers/flow/boundaries.h"
 
@@ -122,10 +123,7 @@ void FlowBox::check_velocity(const at::Tensor& u) const {
   TORCH_CHECK_VALUE(samples_ == 1 || samples_ == u.size(0), "Flow: obstacle holds ", samples_, " samples, u holds ",
                     u.size(0));
   TORCH_CHECK_TYPE(u.scalar_type() == at::kFloat || u.scalar_type() == at::kDouble,
-                   "Flow: u must be float32 or float64, got ", u.scalar_type(),
-                   at::isReducedFloatingType(u.scalar_type())
-                       ? "; keep the step in float32, and let autocast take the network to less"
-                       : "");
+                   "Flow: u must be float32 or float64, got ", u.scalar_type(), hint_of_dtype(u.scalar_type()));
 }
 
 const FlowFields& FlowBox::fields(const at::TensorOptions& options) const {
