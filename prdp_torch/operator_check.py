@@ -1,5 +1,6 @@
 """`check_operator`: whether an operator's parts agree with each other."""
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Literal
 
@@ -245,6 +246,7 @@ def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Itera
         eps = max(torch.finfo(v.dtype).eps, torch.finfo(t.dtype).eps)
         step = eps ** (1 / 3)
         direction = _noise(t, generator) * _own_sizes(t)  # a part of each entry, as they may differ in size
+        direction = torch.where(t == 0, direction.abs(), direction)  # as h of a side may not be less
 
         def changed(s: float, i: int = i, t: Tensor = t, direction: Tensor = direction) -> float:
             tensors = [t + s * direction if j == i else other for j, other in enumerate(given)]
@@ -252,6 +254,8 @@ def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Itera
             return ((product - here) * w).sum().item() / s
 
         above, below = changed(step), changed(-step)
+        if math.isnan(below):
+            below = changed(step / 2)
         terms = torch.zeros_like(direction) if gradient is None else gradient * direction
         slope = terms.sum().item()
         rounding = 40 * eps / step * float((w * sizes).abs().sum())
@@ -266,10 +270,12 @@ def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Itera
 
 
 def _own_sizes(t: Tensor) -> Tensor:
-    """Those of the entries; of zeros, the least of them, or 1."""
-    sizes = t.abs()
+    """Those of the entries; of zeros, the least of them, or 1; 0 of an infinite one, such as the h of a side that
+    holds u."""
+    sizes = torch.where(t.isfinite(), t.abs(), 0.0)
     least = torch.where(sizes > 0, sizes, float("inf")).amin()
-    return torch.where(sizes > 0, sizes, torch.where(least.isfinite(), least, 1.0))
+    of_zeros = torch.where(least.isfinite(), least, 1.0)
+    return torch.where(sizes > 0, sizes, of_zeros) * t.isfinite()
 
 
 def _preconditioner(A: Operator, solver: Solver | None, v: Tensor, w: Tensor) -> Iterator[str]:

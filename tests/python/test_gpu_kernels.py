@@ -56,6 +56,9 @@ def nearly_singular():
     return left @ torch.diag(torch.tensor([1.0, 0.7, 0.5, 4e-7], dtype=F64)) @ right
 
 
+HOLDING = noise(3, 3, 4, seed=6).exp()  # h of a side, which holds u at a cell
+HOLDING[:, 1, 2] = torch.inf
+
 OPERATORS = {
     "heat 1D": lambda dtype: operators.Heat((11,), torch.tensor(0.03, dtype=dtype), 1.0),
     "heat 2D": lambda dtype: operators.Heat(SHAPE, torch.tensor(0.03, dtype=dtype), 1.0, length=(1.0, 2.0)),
@@ -64,7 +67,7 @@ OPERATORS = {
     "robin": lambda dtype: operators.Diffusion(
         noise(3, 3, 4, 5, seed=2, dtype=dtype).exp(),
         shift=20 + noise(1, 3, 4, 5, seed=4, dtype=dtype),
-        boundary=("periodic", ("zero", ("robin", 3.0)), (("robin", noise(3, 3, 4, seed=6, dtype=dtype).exp()), "flux")),
+        boundary=("periodic", ("zero", ("robin", 3.0)), (("robin", HOLDING.to(dtype)), "flux")),
         length=(1.0, 2.0, 0.5),
         faces="arithmetic",
     ),

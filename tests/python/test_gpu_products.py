@@ -33,7 +33,8 @@ def per_axis(rows, *shape, **settings):
 
 
 def robin(rows, sides, axes=(), shape=SHAPE):
-    """Of κ, which may have axes, a shift, and h of four sides: a number, or a field of all or of each."""
+    """Of κ, which may have axes, a shift, and h of four sides: a number, or a field of all or of each, which holds u at
+    one cell."""
 
     def make(kappa, shift, *h):
         low, high, left, right = (("robin", of) for of in h)
@@ -41,6 +42,9 @@ def robin(rows, sides, axes=(), shape=SHAPE):
         return operators.Diffusion(kappa, shift, boundary=sides, length=(1.0, 2.0), per_axis=bool(axes))
 
     h = [noise(*sides[k], seed=5 + k).exp() if sides[k] else torch.tensor(1.3, dtype=F64) for k in range(4)]
+    for field in h:
+        if field.dim() > 0:
+            field[:, 1] = torch.inf
     return make, [noise(rows, *axes, *shape, seed=2).exp(), torch.tensor(9.0, dtype=F64), *h], 2
 
 

@@ -132,6 +132,45 @@ def test_its_limits_are_the_sides_without_flux_and_with_values():
     assert (u > 0).all()
 
 
+def held(h, rows=1, dtype=F64):
+    """h of a side of 5 cells that holds u at the middle three alone."""
+    side = torch.tensor([0.0, h, h, h, 0.7], dtype=dtype)
+    return side.expand(rows, 5).clone()
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("per_axis", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_an_infinite_h_holds_u(dtype, per_axis, backward):
+    """Gradients too: those of a large h, whose own is zero."""
+    b, rtol = rand(2, 1, 6, 5).to(dtype), 1e-12 if dtype == F64 else 1e-6
+
+    def gradients(h):
+        kappa = rand(2, *((2,) if per_axis else ()), 6, 5).to(dtype).requires_grad_()
+        side = held(h, dtype=dtype).requires_grad_()
+        a = Diffusion(kappa, boundary=[(("robin", side), "flux"), "flux"], per_axis=per_axis)
+        u, info = prdp.linear_solve(a, b + a.boundary_rhs(values=0.7), prdp.CG(60, rtol), backward)
+        assert not info.failed.any()
+        return u.detach(), *torch.autograd.grad(u.square().sum(), (kappa, side))
+
+    for found, expected in zip(gradients(torch.inf), gradients(1e12), strict=True):
+        atol = 1e-6 * float(expected.abs().max())
+        torch.testing.assert_close(found, expected, rtol=1e-9 if dtype == F64 else 1e-3, atol=atol)
+
+
+@pytest.mark.parametrize("solver", [prdp.Direct(), prdp.CG(60, 1e-12, preconditioner="multigrid"), prdp.CG(60, 1e-12)])
+def test_a_gradient_beside_an_infinite_h_is_that_of_differences(solver):
+    b = rand(2, 1, 6, 5)
+
+    def mean(kappa):
+        a = Diffusion(kappa, boundary=[(("robin", held(torch.inf)), "flux"), "flux"])
+        return prdp.linear_solve(a, b, solver)[0].mean()
+
+    assert torch.autograd.gradcheck(mean, rand(1, 6, 5).requires_grad_())
+    assert torch.autograd.gradgradcheck(mean, rand(1, 6, 5).requires_grad_(), fast_mode=True)
+    assert prdp.check_operator(Diffusion(rand(1, 6, 5), boundary=[(("robin", held(torch.inf)), "flux"), "flux"]), b)
+
+
 def test_what_is_outside_is_inside_where_nothing_else_holds_u():
     """u = u_ext is the solution of b = 0, whatever h."""
     a = Diffusion(rand(1, 6, 5), boundary=[("robin", rand(1, 5)), ("flux", ("robin", 3.0))])
@@ -164,7 +203,7 @@ def test_vmap_over_h_is_a_loop():
     (("robin", torch.ones(1, 5)), r"h of the low side of axis 1 must be .* where side is \[4\], got \[1, 5\]"),
     ([("robin", torch.ones(5)), "flux"], r"h of the low side of axis 0 must be a number or have shape .*, got \[5\]"),
     (("robin", -1.0), "h of a Robin side must be finite and >= 0, got -1"),
-    (("robin", float("inf")), "h of a Robin side must be finite"),
+    (("robin", float("inf")), 'must be finite and >= 0, got inf; "zero" holds u at 0 there'),
     ([("robin", torch.full((1, 5), -2.0)), "flux"], "h of a Robin side must be finite and >= 0, got -2"),
 ])  # fmt: skip
 def test_mistakes_are_named(boundary, words):

@@ -124,7 +124,8 @@ void DiffusionOperator::check_robin(Checks checks) const {
     if (checks != Checks::kAll && (h.dim() > 0 || (checks == Checks::kHost && !h.is_cpu()))) continue;
     const double least = h.min().item<double>();
     TORCH_CHECK_VALUE(!(least < 0.0) && (h.dim() > 0 || std::isfinite(least)),
-                      "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
+                      "Diffusion: h of a Robin side must be finite and >= 0, got ", least,
+                      least > 0.0 ? "; \"zero\" holds u at 0 there" : "");
   }
 }
 

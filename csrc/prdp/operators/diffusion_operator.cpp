@@ -38,11 +38,18 @@ at::Tensor or_nan(const at::Tensor& t, const at::Tensor& allowed) {
 }
 
 /// Of two conductances a > 0 and b >= 0 in series, a b/(a + b), as s/(1 + s/l) of the smaller and the larger one: what
-/// autograd makes of that neither cancels, where a quotient by a + b does, nor overflows.
+/// autograd makes of that neither cancels, where a quotient by a + b does, nor overflows, and b may be infinite.
 at::Tensor in_series(const at::Tensor& a, const at::Tensor& b) {
   const auto b_is_smaller = b.le(a);
   const auto smaller = at::where(b_is_smaller, b, a), larger = at::where(b_is_smaller, a, b);
   return smaller / (1.0 + smaller / larger);
+}
+/// a/(a + b) and b/(a + b), in the same way.
+std::array<at::Tensor, 2> shares(const at::Tensor& a, const at::Tensor& b) {
+  const auto b_is_smaller = b.le(a);
+  const auto ratio = at::where(b_is_smaller, b, a) / at::where(b_is_smaller, a, b);
+  const auto of_larger = (1.0 + ratio).reciprocal(), of_smaller = ratio * of_larger;
+  return {at::where(b_is_smaller, of_larger, of_smaller), at::where(b_is_smaller, of_smaller, of_larger)};
 }
 
 /// Summed over the samples where these share one.
@@ -115,8 +122,9 @@ DiffusionOperator::SideProducts DiffusionOperator::side_product_rule(int64_t axi
   // Of within·beyond/(within + beyond), with within = 2κ/w² and beyond = h/w, where w is the width of a cell.
   const auto within = 2.0 * inverse_width2(axis) * at_side(kappa_along(axis)),
              beyond = inverse_width(axis) * robin(axis, end);
-  const auto of_within = (beyond / (within + beyond)).square().nan_to_num(0.0);
-  const auto of_beyond = (within / (within + beyond)).square().nan_to_num(0.0);
+  const auto [share_of_within, share_of_beyond] = shares(within, beyond);
+  const auto of_within = share_of_beyond.square().nan_to_num(0.0);
+  const auto of_beyond = share_of_within.square().nan_to_num(0.0);
   const auto h_bar = like(robin(axis, end), product * of_beyond / inverse_width(axis));
   return {2.0 * product * of_within, h_bar.dim() == 0 ? h_bar : h_bar.squeeze(d).squeeze(1)};
 }

@@ -162,7 +162,8 @@ class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kKap
     const T h = robin_[at_side] ? robin_[at_side][on_side] : robin_number_[at_side];
     if (h < T(0)) return std::numeric_limits<T>::quiet_NaN();  // not allowed
     const T outside = inverse_width_[axis] * h;
-    return within * (outside / (within + outside));  // in series
+    const T smaller = within < outside ? within : outside, larger = within < outside ? outside : within;
+    return smaller / (1 + smaller / larger);  // in series, and h may be infinite
   }
   static T mean(T a, T b) { return kHarmonic ? 2 * a * (b / (a + b)) : (a + b) / 2; }
 

@@ -98,7 +98,7 @@ struct DiffusionProductRule {
     const int on_side = axis == 0 ? at[1] * n[2] + at[2] : axis == 1 ? at[0] * n[2] + at[2] : at[0] * n[1] + at[1];
     const T within = 2 * scale(axis) * kappa_at(s, axis, point);
     const T beyond = static_cast<T>(inverse_width[axis]) * robin[side].at(s, on_side);
-    const T part = (of_side ? beyond : within) / (within + beyond);
+    const T part = 1 / (1 + (of_side ? within / beyond : beyond / within));  // h may be infinite
     return part == part ? part * part : T(0);
   }
 
