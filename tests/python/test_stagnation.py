@@ -211,3 +211,40 @@ def test_sweeps_that_stall_a_little_above_rtol_end_there(max_iter):
     assert step.info.solved.all() and (step.info.iterations < 600).all() and (step.info.residual < 2e-5).all()
     step(u.double())
     assert (step.info.status == 1).all() and (step.info.residual <= 1e-5).all()
+
+
+def smooth(samples, n):
+    x = (torch.arange(n, dtype=F64) + 0.5) / n
+    m = torch.arange(1, 4)
+    waves = torch.cos(torch.pi * m[:, None] * x)
+    weights = torch.randn(samples, 3, 3, dtype=F64, generator=torch.Generator().manual_seed(0)) / (m[:, None] + m)
+    return torch.exp(1.2 * torch.einsum("bij,iy,jx->byx", weights, waves, waves))
+
+
+@pytest.mark.parametrize("method, counts, warm", [
+    (lambda k: prdp.CG(k, preconditioner="multigrid"), (1, 2, 3), False),
+    (lambda k: prdp.BiCGStab(k, preconditioner="multigrid"), (1,), False),
+    (lambda k: prdp.GMRES(k, restart=2, preconditioner="multigrid"), (1,), False),
+    (prdp.Multigrid, (1, 2, 3, 4, 5), False),
+    (lambda k: prdp.CG(k, preconditioner="diagonal"), (100, 200), False),
+    (prdp.MINRES, (50, 150), False),
+    (prdp.Jacobi, (1, 2, 20, 64, 65, 400), True),
+    (prdp.SteepestDescent, (1, 20, 100), True),
+], ids=["CG", "BiCGStab", "GMRES", "Multigrid", "diagonal", "MINRES", "Jacobi", "SteepestDescent"])  # fmt: skip
+def test_what_max_iter_ended_is_no_stagnation(method, counts, warm):
+    """Of float32, where float64 has the same residual after as many iterations, however near to ε ‖A‖ ‖u‖ that is."""
+    n = 128
+    kappa, b, start = smooth(4, n), torch.ones(4, 1, n, n, dtype=F64), None
+    if warm:
+        start = prdp.linear_solve(Diffusion(kappa), b, prdp.Direct())[0]
+        start = start * (1 + 1e-3 * torch.sin(3 * torch.linspace(0, 1, n, dtype=F64)))
+    compared = 0
+    with told() as words:
+        for k in counts:
+            _, exact = prdp.linear_solve(Diffusion(kappa), b, method(k), x0=start)
+            of_float = None if start is None else start.float()
+            _, info = prdp.linear_solve(Diffusion(kappa.float()), b.float(), method(k), x0=of_float)
+            same = (info.residual - exact.residual).abs() < 0.05 * exact.residual
+            assert (info.status[same] == prdp.SolveStatus.MAX_ITER).all(), (k, info)
+            compared += int(same.sum())
+    assert compared > 2 * len(counts) and not words

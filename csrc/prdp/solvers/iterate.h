@@ -66,19 +66,22 @@ PRDP_NOINLINE void conclude(Space& space, Method& method, typename Space::States
   const auto open = [](const SampleState& s) { return !s.concluded; };
   if (std::none_of(states.begin(), states.end(), open)) return;
   space.freeze_unless(states, open);
+  const auto exhausted = exhausted_of(space, method);
   const auto residual2 = space.values_of(method.recompute_residual());
   const auto broken = space.broken();
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     if (s.concluded) continue;
+    const double known2 = s.residual2;
     s.residual2 = residual2[i];
+    s.on_its_way = is_gaining<Method>(s, known2) && !is_exhausted<Method>(exhausted, i);
     if (broken[i]) s.status = SolveStatus::kBreakdown;
     if (!ran_away(s)) judge(s, rtol);
   }
   const auto doubtful = [rtol](const SampleState& s) {
-    const bool unsolved =
-        s.status == SolveStatus::kMaxIter || (kMayExhaust<Method> && s.status == SolveStatus::kBreakdown);
-    return rtol > 0.0 && !s.concluded && unsolved;
+    const bool stalled = s.status == SolveStatus::kMaxIter && !s.on_its_way;
+    const bool broke_down = kMayExhaust<Method> && s.status == SolveStatus::kBreakdown;
+    return rtol > 0.0 && !s.concluded && (stalled || broke_down);
   };
   stop_at_rounding_floor(space, method, states, rtol, doubtful, kManyEstimates);
   for (auto& s : states) {

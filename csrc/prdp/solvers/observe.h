@@ -13,12 +13,17 @@ auto exhausted_of(Space& space, const Method& method) {
   if constexpr (kMayExhaust<Method>) return space.values_of(method.exhausted());
   else return 0;
 }
+template <class Method, class Exhausted>
+bool is_exhausted([[maybe_unused]] const Exhausted& exhausted, [[maybe_unused]] size_t i) {
+  if constexpr (kMayExhaust<Method>) return exhausted[i] != 0.0;
+  else return false;
+}
 
 /// Judges each active sample by the residual that the method knows. Stops what diverged, overflowed or broke down;
 /// samples that seem converged go on as candidates. Returns whether there are any.
 template <class Space, class Method, class Exhausted>
 bool judge_known_residuals(Space& space, Method& method, typename Space::States& states, double rtol,
-                           [[maybe_unused]] const Exhausted& exhausted) {
+                           const Exhausted& exhausted) {
   const auto residual2 = space.values_of(method.residual2());
   const auto broken = space.broken();
   bool any_candidates = false;
@@ -34,7 +39,7 @@ bool judge_known_residuals(Space& space, Method& method, typename Space::States&
     }
     judge(s, rtol);
     if constexpr (kMayExhaust<Method>) {
-      if (s.active && rtol > 0.0) judge_progress(s, exhausted[i] != 0.0);
+      if (s.active && rtol > 0.0) judge_progress(s, is_exhausted<Method>(exhausted, i));
     }
     if constexpr (kTakesStrides<Method>) plan_next_look(s, method.residual_is_log_convex(), rtol);
     if (s.status != SolveStatus::kConverged) continue;
@@ -64,7 +69,7 @@ void stop_stalled(Space& space, const Method& method, typename Space::States& st
 /// Judges the candidates by their true residual, as a recursive one may have drifted from it.
 template <class Space, class Method, class Exhausted>
 void confirm_candidates(Space& space, Method& method, typename Space::States& states, double rtol,
-                        [[maybe_unused]] const Exhausted& exhausted) {
+                        const Exhausted& exhausted) {
   space.freeze_unless(states, [](const SampleState& s) { return s.candidate; });
   const auto true_residual2 = space.values_of(method.recompute_residual());
   for (size_t i = 0; i < states.size(); ++i) {
@@ -73,9 +78,8 @@ void confirm_candidates(Space& space, Method& method, typename Space::States& st
     s.residual2 = true_residual2[i];
     judge(s, rtol);
     if (s.active && has_drifted(s, rtol)) s.stop(SolveStatus::kStagnated);
-    if constexpr (kMayExhaust<Method>) {
-      if (s.status == SolveStatus::kConverged && exhausted[i] != 0.0) s.status = SolveStatus::kConvergedBreakdown;
-    }
+    if (s.status == SolveStatus::kConverged && is_exhausted<Method>(exhausted, i))
+      s.status = SolveStatus::kConvergedBreakdown;
     s.rejected2 = s.residual2;
     ++s.false_claims;
   }

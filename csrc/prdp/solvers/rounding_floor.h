@@ -31,6 +31,17 @@ bool is_idle(const SampleState& s) {
   return (kTakesStrides<Method> || kContracts<Method>) && s.iterations - s.best > patience;
 }
 
+/// Whether a sample that max_iter ended still gained in its last iteration, so that its residual is no rounding,
+/// however near to the floor. `known2` is the residual² that the method knew; residual2 is the true one.
+template <class Method>
+bool is_gaining(const SampleState& s, double known2) {
+  if (kIsExact<Method>) return false;
+  // A recursive residual falls on where the true one does not. A false claim has set it to the true one.
+  if (kHasRecursiveResidual<Method>) return s.false_claims == 0 && s.residual2 <= 4.0 * known2;
+  const double gain2 = kTakesStrides<Method> ? 1.0 : 0.5;
+  return s.best == s.iterations && known2 < gain2 * s.previous2;
+}
+
 /// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor, or nothing is gained
 /// any more; 32 for direct methods where rtol lies below that, as their sums are long; 100 where a space is exhausted.
 template <class Method>
