@@ -90,6 +90,45 @@ def test_a_right_one_says_nothing_however_few_iterations_ran(solver, dtype):
             gradient(a, solver, scale if seed % 2 else None, dtype, seed=seed + 100, on_failure="warn")
 
 
+@pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("solver", [prdp.GMRES(9, restart=12), prdp.BiCGStab(20), prdp.Direct()], ids=repr)
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_a_number_of_a_loop_is_said(backward, solver):
+    """The product is made again in the backward pass, when the loop is over."""
+    m = matrix()
+    u = torch.ones(1, 12, dtype=torch.float64, requires_grad=True)
+    for c in (0.5, 1.0, 2.0):
+        a = operators.Function(lambda v: v + c * (v @ m.mT))  # noqa: B023
+        u, _ = prdp.linear_solve(a, u, solver, backward)
+    with pytest.warns(UserWarning, match="the functions still see what they captured, tensors and numbers"):
+        u.sum().backward()
+
+
+@pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(
+    "solver",
+    [prdp.GMRES(2, restart=3), prdp.BiCGStab(4), prdp.BiCGStab(60), prdp.Jacobi(3), prdp.SteepestDescent(5, rtol=0.0),
+     prdp.CG(5), prdp.CG(50), prdp.MINRES(7)],
+    ids=repr,
+)  # fmt: skip
+def test_iterations_that_are_differentiated_say_nothing(solver, dtype):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message=".*is not that of the A that was solved")
+        for seed in range(10):
+            m = matrix(dtype=dtype, seed=seed)
+            if isinstance(solver, (prdp.CG, prdp.MINRES, prdp.SteepestDescent)):
+                m = m @ m.mT
+            b = torch.randn(3, 12, generator=torch.Generator().manual_seed(seed)).to(dtype).requires_grad_()
+            scale = torch.tensor(1.0, dtype=dtype, requires_grad=True)
+            a = operators.Function(
+                lambda v, s, m=m: s * (v @ m.mT), lambda v, s, m=m: s * (v @ m), scale, lambda s, m=m: s * m.diagonal()
+            )
+            u, _ = prdp.linear_solve(a, b, solver, "unrolled", on_failure="return")
+            torch.autograd.grad(u.square().sum(), (b, scale))
+
+
 def test_what_was_written_to_is_not_compared():
     m = matrix()
     b = torch.ones(1, 12, dtype=torch.float64)

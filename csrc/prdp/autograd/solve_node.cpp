@@ -25,8 +25,8 @@ SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
 }
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {
-  // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve said are unrolled mode's,
-  // and of a Function they serve to check its transpose. Where a failed sample may have passed, its status says so.
+  // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve said are unrolled mode's. Of
+  // a Function all of them serve to check its derivative. Where a failed sample may have passed, its status says so.
   const bool unrolled = options_.backward == Backward::kUnrolled;
   if (unrolled) {
     b_ = SavedVariable(b, /*is_output=*/false);
@@ -38,7 +38,8 @@ void SolveNode::save(const at::Tensor& b, const Solved& solved) {
   }
   if (unrolled || options_.on_failure != OnFailure::kRaise) status_ = SavedVariable(solved.status, /*is_output=*/false);
   const bool can_differ = is_function(a_) && !is_singular(a_) && all_plain(a_.tensors);
-  if (can_differ && !unrolled && waits_for_report(options_)) identity_.keep(b, solved);
+  const bool is_proportional = !unrolled || !solved.x0.defined();  // u to b
+  if (can_differ && is_proportional && waits_for_report(options_)) identity_.keep(b, solved, unrolled);
   for (const auto& t : a_.tensors) tensors_.emplace_back(t, /*is_output=*/false);
   a_.tensors.clear();
 }

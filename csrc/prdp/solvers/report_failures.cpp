@@ -263,14 +263,15 @@ void warn_of_constant_cycles() {
   });
 }
 
-void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_solve, double of_adjoint) {
+void warn_of_another_product(FunctionCode& code, bool unrolled, int64_t sample, double of_b, double of_u) {
   if (code.warned_of_transpose.exchange(true) && !c10::WarningUtils::get_warnAlways()) return;
   std::ostringstream text;
-  text << "adjoint solve: the gradient of sample " << sample
-       << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
-       << " and ⟨u, ū⟩ = " << of_adjoint << " should be equal. Is "
+  text << (unrolled ? "unrolled solve" : "adjoint solve") << ": the gradient of sample " << sample
+       << " is wrong, as this Function's " << (unrolled ? "product" : "transpose")
+       << " is not that of the A that was solved: " << (unrolled ? "⟨b̄, b⟩" : "⟨λ, b⟩") << " = " << of_b
+       << " and ⟨u, ū⟩ = " << of_u << " should be equal. Is "
        << in_language("`transpose` right, or A symmetric where symmetric=True", "`apply_transpose` right")
-       << ", and do the functions still see the tensors that they captured? "
+       << ", and do the functions still see what they captured, tensors and numbers? "
        << in_language("prdp.check_operator tells", "To check: ⟨v, A u⟩ = ⟨Aᵀ v, u⟩ for random u and v");
   warn_this_once(text.str(), /*may_get_worse=*/false);
 }
