@@ -36,7 +36,8 @@ def real(who: str, name: str, value: object) -> float:
             return float(value)
         except OverflowError:
             raise ValueError(f"{who}: {name} must be less than 2**1024, got a number of more digits") from None
-    raise TypeError(f"{who}: {name} must be a real number, got {shown(value)}")
+    hint = "; take .item(), as it gets no gradient" if isinstance(value, Tensor) and value.numel() == 1 else ""
+    raise TypeError(f"{who}: {name} must be a real number, got {shown(value)}{hint}")
 
 
 def optional(check: Callable[[str, str, object], T], who: str, name: str, value: object) -> T | None:

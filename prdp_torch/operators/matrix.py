@@ -35,7 +35,10 @@ class Matrix(Operator):
                 f"linear_solve: A must be a dense or sparse CSR tensor, got {matrix.layout}; take A.to_sparse_csr()"
             )
         if matrix.dim() not in (2, 3) or matrix.shape[-1] != matrix.shape[-2]:
-            raise ValueError(f"linear_solve: A must have shape (n, n) or (batch, n, n), got {tuple(matrix.shape)}")
+            hint = "; if it is a field, give an operator that is made of it, such as Diffusion" * (matrix.dim() > 3)
+            raise ValueError(
+                f"linear_solve: A must have shape (n, n) or (batch, n, n), got {tuple(matrix.shape)}{hint}"
+            )
         if self.kind == "csr" and given["crow"].shape[-1] != matrix.shape[-1] + 1:
             raise ValueError(
                 f"linear_solve: a CSR matrix of {matrix.shape[-1]} rows needs a crow of one more, got "

@@ -11,8 +11,10 @@ void check_matrix_vector(const at::Tensor& b, const at::Tensor& values, int64_t 
                     ",) or (batch, ", n, "), got ", b.sizes(),
                     b.dim() == 3 && b.size(2) == n && !batched
                         ? "; the right-hand sides of one matrix are samples: b.flatten(0, 1)"
-                    : b.dim() == 3 && b.size(2) == n
+                    : b.dim() == 3 && (b.size(2) == n || b.size(1) == n)
                         ? in_language("; for several right-hand sides of a matrix, take torch.func.vmap over them", "")
+                    : batched && b.dim() == 4 && b.size(2) == n && b.size(3) == n
+                        ? "; if A is a field, give an operator that is made of it, such as Diffusion"
                     : b.dim() > 2 ? "; flatten b, or make the product a Function"
                                   : "");
   TORCH_CHECK_VALUE(!batched || b.size(0) == values.size(0), "linear_solve: A holds ", values.size(0),
