@@ -105,7 +105,7 @@ def test_wrong_kinds_of_arguments():
         (lambda: prdp.Poisson((30.5,), prdp.Jacobi(1)), "Poisson: every extent of shape must be a whole number"),
         (lambda: prdp.Heat((30,), "a", 1.0, prdp.Jacobi(1)), "Heat: nu must be a real number, got 'a'"),
         (lambda: prdp.Heat((30,), 1e-3, None, prdp.Jacobi(1)), "Heat: dt must be a real number, got None"),
-        (lambda: operators.Heat((30,), 1e-3, torch.tensor(0.1)), r"got tensor\(0.1000\); take .item\(\), as it gets no"),
+        (lambda: operators.Heat((30,), 1e-3, torch.tensor(0.1)), r"got tensor\(0.1000\); take .item\(\), as it"),
         (lambda: heat(backward=None), "Heat: backward must be a string, got None"),
         (lambda: heat(adjoint_max_iter="3"), "Heat: adjoint_max_iter must be a whole number, got '3'"),
         (lambda: heat()([0.0] * 30), "Heat: u must be a torch tensor, got list"),
