@@ -143,6 +143,23 @@ def test_a_piece_that_floats_in_a_void_is_said_with_its_error(void, precondition
         assert ((u - exact).abs().amax() < 1e-3 * exact.abs().amax()) == (not said)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("clay", [1e-9, 1e-7, 1e-5])
+def test_two_aquifers_in_a_closed_box_are_said(clay, dtype, always):
+    """No side holds u: its mean is zero, and the clay alone holds one aquifer to the other."""
+    kappa, b = torch.full((1, 17, 20), 1e-3, dtype=F64), torch.zeros(1, 1, 17, 20, dtype=F64)
+    kappa[0, 8] = clay
+    b[0, 0, 3, 3], b[0, 0, 5, 16] = -1e-3, 1e-3
+    exact, _ = prdp.linear_solve(operators.Diffusion(kappa, boundary="flux"), b, prdp.Direct())
+    a = operators.Diffusion(kappa.to(dtype), boundary="flux")
+    (u, info), said = warnings_of(lambda: prdp.linear_solve(a, b.to(dtype), prdp.CG(5000, preconditioner="diagonal")))
+    error = ((u - exact).abs().max() / u.abs().max()).item()
+    assert info.solved.all() and len(said) == (error > 1e-3)
+    for text in said:
+        claimed = float(text.split("least about ")[1].split(" %")[0]) / 100
+        assert 0.5 * error < claimed < 1.1 * error
+
+
 @pytest.mark.parametrize("weight", [1e2, 1e3, 1e4])
 def test_the_error_beside_a_soft_penalty_is_that_of_its_smooth_part(weight, always):
     """It is many times what the residual of a row tells."""

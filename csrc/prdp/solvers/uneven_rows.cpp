@@ -123,8 +123,10 @@ at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const
   const auto further = go_on(0.0);
   auto changes = share_of(further);
   if (!(changes.max() > look.much()).item<bool>()) return changes;
+  const bool keeps_null_space = look.role.a.kind == "singular_diffusion";  // the constant, whatever κ
   auto is_free = maps_constant_to_zero(a, look.b, /*transposed=*/false, /*jointly=*/true);
-  if (!is_singular(look.role.a)) {
+  if (keeps_null_space) is_free.fill_(false);
+  if (keeps_null_space || !is_singular(look.role.a)) {
     const auto moved = share_of(go_on(epsilon_of(look.b)) - further + u);
     is_free = is_free.logical_or(sample_maxima(moved) > 0.3 * sample_maxima(changes));
   }
