@@ -106,3 +106,21 @@ def test_operators_of_unknown_spectrum_are_refused_by_name(operator, backward):
     b = torch.ones(1, 4) if isinstance(operator, torch.Tensor) else torch.ones(1, 1, 4)
     with pytest.raises(ValueError, match="Chebyshev: the spectrum is known of Heat and Poisson operators alone"):
         prdp.linear_solve(operator, b.requires_grad_(), prdp.Chebyshev(3), backward=backward)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("k", [1, 2, 3, 40, 64, 65, 130])
+def test_each_sample_has_the_weights_of_its_own_spectrum(k, dtype):
+    nu = torch.tensor([1e-3, 0.1, 1e-2, 0.1], dtype=dtype)
+    b = field((9, 7), batch=4, dtype=dtype)
+    u, info = prdp.linear_solve(operators.Heat((9, 7), nu, 1.0), b, prdp.Chebyshev(k, rtol=0.0))
+    for i in range(4):
+        alone, _ = prdp.linear_solve(
+            operators.Heat((9, 7), nu[i : i + 1], 1.0), b[i : i + 1], prdp.Chebyshev(k, rtol=0.0)
+        )
+        assert torch.equal(u[i], alone[0])
+        expected, exact = polynomial(dense_heat((9, 7), float(nu[i])), b[i].flatten(1).double().numpy(), k)
+        error = np.abs(u[i].flatten(1).numpy() - expected).max()
+        assert error <= 1e3 * torch.finfo(dtype).eps * np.abs(exact).max()
+    _, info = prdp.linear_solve(operators.Heat((9, 7), nu, 1.0), b, prdp.Chebyshev(500, rtol=1e-4))
+    assert info.iterations[1] == pytest.approx(info.iterations[3], abs=3)

@@ -28,7 +28,7 @@ class JacobiMethod {
     space_.copy(c_, next_);
     residual2_ = space_.b2();
     ready_ = true;
-    done_ = 0;
+    done_ = first_weight_ = 0;  // the sample before may have had another spectrum
   }
   void step(int64_t n) {
     done_ += n;
