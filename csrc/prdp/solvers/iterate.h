@@ -74,14 +74,15 @@ PRDP_NOINLINE void conclude(Space& space, Method& method, typename Space::States
     if (s.concluded) continue;
     const double known2 = s.residual2;
     s.residual2 = residual2[i];
-    s.on_its_way = is_gaining<Method>(s, known2) && !is_exhausted<Method>(exhausted, i);
     if (broken[i]) s.status = SolveStatus::kBreakdown;
     if (!ran_away(s)) judge(s, rtol);
+    s.on_its_way =
+        s.status == SolveStatus::kMaxIter && seems_on_its_way<Method>(s, known2) && !is_exhausted<Method>(exhausted, i);
   }
   const auto doubtful = [rtol](const SampleState& s) {
-    const bool stalled = s.status == SolveStatus::kMaxIter && !s.on_its_way;
-    const bool broke_down = kMayExhaust<Method> && s.status == SolveStatus::kBreakdown;
-    return rtol > 0.0 && !s.concluded && (stalled || broke_down);
+    const bool unsolved =
+        s.status == SolveStatus::kMaxIter || (kMayExhaust<Method> && s.status == SolveStatus::kBreakdown);
+    return rtol > 0.0 && !s.concluded && unsolved;
   };
   stop_at_rounding_floor(space, method, states, rtol, doubtful, kManyEstimates);
   for (auto& s : states) {

@@ -31,22 +31,23 @@ bool is_idle(const SampleState& s) {
   return (kTakesStrides<Method> || kContracts<Method>) && s.iterations - s.best > patience;
 }
 
-/// Whether a sample that max_iter ended still gained in its last iteration, so that its residual is no rounding,
-/// however near to the floor. `known2` is the residual² that the method knew; residual2 is the true one.
+/// Whether a sample that max_iter ended seems to have gained to the last. `known2` is the residual² that the method
+/// knew; residual2 is the true one.
 template <class Method>
-bool is_gaining(const SampleState& s, double known2) {
-  if (kIsExact<Method>) return false;
-  // A recursive residual falls on where the true one does not. A false claim has set it to the true one.
+bool seems_on_its_way(const SampleState& s, double known2) {
+  if (kIsExact<Method> || s.iterations == 0) return false;
+  // A recursive residual falls on where the true one does not. After a false claim it starts from the true one again.
   if (kHasRecursiveResidual<Method>) return s.false_claims == 0 && s.residual2 <= 4.0 * known2;
-  const double gain2 = kTakesStrides<Method> ? 1.0 : 0.5;
-  return s.best == s.iterations && known2 < gain2 * s.previous2;
+  return s.best == s.iterations;
 }
 
-/// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor, or nothing is gained
-/// any more; 32 for direct methods where rtol lies below that, as their sums are long; 100 where a space is exhausted.
+/// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor and the sample does not
+/// seem on its way, or nothing is gained any more; 32 for direct methods where rtol lies below that, as their sums are
+/// long; 100 where a space is exhausted.
 template <class Method>
 double slack_of_floor(const SampleState& s, double rtol, double floor) {
   if (s.status == SolveStatus::kBreakdown) return 100.0;
+  if (s.on_its_way) return 1.0;
   const double target = rtol * std::sqrt(s.b2);
   if (kIsExact<Method>) return target <= 32.0 * floor ? 32.0 : 1.0;
   const bool gains_nothing = !kOscillates<Method> && is_idle<Method>(s);
@@ -69,17 +70,20 @@ auto floors_of_suspects(Space& space, const Method& method, const typename Space
   return floors;
 }
 
-// What a product may round, in estimates of ε ‖|A| |u|‖: by the first estimate, and by the largest of several.
-inline constexpr double kRoundingsOfProduct = 64.0, kFewRoundings = 4.0;
+// What a product may round, in estimates of ε ‖|A| |u|‖: by the first estimate, by the largest of several, and where a
+// sample seems on its way, which is then no further off than u is rounded.
+inline constexpr double kRoundingsOfProduct = 64.0, kFewRoundings = 4.0, kRoundingsOnItsWay = 2.0;
 inline constexpr int64_t kManyEstimates = 8;  // at most kSignPatterns
 
 /// Whether a suspect's residual is rounding, by this attempt at an estimate of ε ‖|A| |u|‖. The first allows slack and
-/// many roundings. The others allow no slack and few roundings, as one sample then has several chances to pass.
+/// many roundings. The others allow no slack and few roundings, as one sample then has several chances to pass. One
+/// that seems on its way has one chance, without slack.
 template <class Method>
 bool residual_is_rounding(const SampleState& s, double rtol, double floor, double rounding, int64_t attempt) {
   const double residual = std::sqrt(s.residual2);
-  if (attempt == 0) return residual <= slack_of_floor<Method>(s, rtol, floor) * (kRoundingsOfProduct * rounding);
-  return residual <= floor && residual <= kFewRoundings * rounding;
+  if (attempt == 0 && !s.on_its_way)
+    return residual <= slack_of_floor<Method>(s, rtol, floor) * (kRoundingsOfProduct * rounding);
+  return residual <= floor && residual <= (s.on_its_way ? kRoundingsOnItsWay : kFewRoundings) * rounding;
 }
 
 /// Stops the `doubtful` samples whose residual is rounding: a few floors ε ‖A‖ ‖u‖ at most, and of the order of
@@ -97,10 +101,12 @@ PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, ty
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
       const double floor = suspected[i], rounding = space.epsilon() * std::sqrt(componentwise_scale2[i]);
-      if (!(floor > 0.0) || !residual_is_rounding<Method>(s, rtol, floor, rounding, attempt)) continue;
+      if (!(floor > 0.0)) continue;
+      const bool is_rounding = residual_is_rounding<Method>(s, rtol, floor, rounding, attempt);
+      if (is_rounding || s.on_its_way) suspected[i] = 0.0;
+      if (!is_rounding) continue;
       s.stop(SolveStatus::kStagnated);
       s.floor2 = floor * floor;
-      suspected[i] = 0.0;
     }
   }
 }

@@ -31,12 +31,11 @@ struct SampleState {
   bool active = true;  // still iterating; a frozen sample's u no longer changes
   bool candidate = false;  // its residual has just come below rtol, to be confirmed
   bool concluded = false;  // residual2 is the true one of the last iterate, and conclude() leaves the sample alone
-  bool on_its_way = false;  // to a smaller residual when max_iter ended it, which is known at the end
+  bool on_its_way = false;  // to a smaller residual, it seems, when max_iter ended it
   SolveStatus status = SolveStatus::kMaxIter;
   int64_t iterations = 0;
   int64_t applications = 0;
   double residual2 = 0.0;
-  double previous2 = 0.0;  // the one that was noted before it
   int64_t looked_at = 0;  // iterations when the residual was last looked at
   double checked2 = 0.0;  // the residual then
   int64_t next_look = 0;  // iterations when it is to be looked at next
@@ -53,7 +52,6 @@ struct SampleState {
   /// Lets the first cycle end once the estimate of its residual is a tenth of rtol ‖b‖: rounding moves it less.
   void end_cycles_at(double rtol) { enough2 = 0.01 * rtol * rtol * b2; }
   void note(double fresh2) {
-    previous2 = residual2;
     residual2 = fresh2;
     if (!(fresh2 < best2)) return;
     best2 = fresh2;
@@ -69,7 +67,7 @@ struct SampleState {
   void rewind(int64_t iterations_allowed) {
     cap = iterations_allowed;
     active = cap > 0;
-    concluded = candidate = false;
+    concluded = candidate = on_its_way = false;
     status = SolveStatus::kMaxIter;
     iterations = cycles_without_progress = next_look = false_claims = 0;
     floor2 = 0.0;
