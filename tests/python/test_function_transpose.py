@@ -105,6 +105,37 @@ def test_a_number_of_a_loop_is_said(backward, solver):
 
 
 @pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("dtype, factor", [(torch.float32, 1.03), (torch.float64, 1 + 1e-5)], ids=str)
+@pytest.mark.parametrize("create_graph", [False, True])
+@pytest.mark.parametrize("start", [False, True])
+def test_a_product_that_has_changed_a_little_is_said(dtype, factor, create_graph, start):
+    m, c = matrix(dtype=dtype), 1.0
+    b = torch.ones(2, 12, dtype=dtype, requires_grad=True)
+    a = operators.Function(lambda v: v + c * (v @ m.mT))
+    u, _ = prdp.linear_solve(a, b, prdp.BiCGStab(6), "unrolled", x0=torch.zeros_like(b) if start else None)
+    c = factor
+    with pytest.warns(UserWarning, match=r"\|b - A u\| is .* now, and was"):
+        torch.autograd.grad(u.sum(), b, create_graph=create_graph)
+
+
+@pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("solver", [prdp.CG(60, rtol=1e-2), prdp.CG(40), prdp.BiCGStab(40), prdp.MINRES(100)], ids=repr)
+def test_a_derivative_that_rounding_has_made_wrong_is_no_other_product(solver, dtype):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message=".*is not the A that was solved")
+        for seed in range(5):
+            kappa = torch.randn(1, 24, 24, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+            diffusion = operators.Diffusion((1 + seed % 2) * kappa.exp().to(dtype))
+            b = torch.rand(2, 1, 24, 24, generator=torch.Generator().manual_seed(seed)).to(dtype).requires_grad_()
+            u, _ = prdp.linear_solve(
+                operators.Function(diffusion.apply, symmetric=True), b, solver, "unrolled", on_failure="return"
+            )
+            torch.autograd.grad(u.square().sum(), b)
+
+
+@pytest.mark.usefixtures("always")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize(
     "solver",
@@ -115,7 +146,7 @@ def test_a_number_of_a_loop_is_said(backward, solver):
 def test_iterations_that_are_differentiated_say_nothing(solver, dtype):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        warnings.filterwarnings("error", message=".*is not that of the A that was solved")
+        warnings.filterwarnings("error", message=".*is not the A that was solved")
         for seed in range(10):
             m = matrix(dtype=dtype, seed=seed)
             if isinstance(solver, (prdp.CG, prdp.MINRES, prdp.SteepestDescent)):

@@ -38,8 +38,7 @@ void SolveNode::save(const at::Tensor& b, const Solved& solved) {
   }
   if (unrolled || options_.on_failure != OnFailure::kRaise) status_ = SavedVariable(solved.status, /*is_output=*/false);
   const bool can_differ = is_function(a_) && !is_singular(a_) && all_plain(a_.tensors);
-  const bool is_proportional = !unrolled || !solved.x0.defined();  // u to b
-  if (can_differ && is_proportional && waits_for_report(options_)) identity_.keep(b, solved, unrolled);
+  if (can_differ && waits_for_report(options_)) identity_.keep(b, solved);
   for (const auto& t : a_.tensors) tensors_.emplace_back(t, /*is_output=*/false);
   a_.tensors.clear();
 }
@@ -82,11 +81,13 @@ variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& so
   const auto vjp = [&](at::IntArrayRef wanted) {
     return solve_vjp(cotangent, solved, a, options_, wanted, by_kernel ? linear_solve_unrecorded : linear_solve);
   };
-  if (!by_kernel || !identity.has_kept()) return vjp(needed).gradients;
+  const bool unrolled = options_.backward == Backward::kUnrolled;
+  if (unrolled && identity.has_kept()) identity.check_product(*make_operator(a), *products_->code);
+  if (unrolled || !by_kernel || !identity.has_kept()) return vjp(needed).gradients;
   auto with_lambda = needed;
   with_lambda[0] = 1;
   auto found = vjp(with_lambda);
-  identity.check(cotangent, found.gradients[0], found.info, *products_->code);
+  identity.check_adjoint(cotangent, found.gradients[0], found.info, *products_->code);
   if (!needed[0]) found.gradients[0] = at::Tensor();
   return std::move(found.gradients);
 }

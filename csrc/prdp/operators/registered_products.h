@@ -27,7 +27,7 @@ struct Products {
 /// What is shared by all products that are made of the same code, as those of a step that makes its operator anew.
 struct FunctionCode {
   std::atomic<int64_t> solves{0};                 // see refuse_nonlinear_product
-  std::atomic<bool> warned_of_transpose{false};  // see warn_of_another_product
+  std::atomic<bool> warned_of_product{false};  // see warn_of_another_transpose and warn_of_another_product
 };
 
 /// Keeps products alive under a number, because functions cannot pass through torch's dispatcher but numbers can.

@@ -31,8 +31,11 @@ void warn_of_constant_cycles();
 /// Says once that the tensors of a preconditioner get no gradient.
 void warn_of_constant_preconditioner();
 
-/// Warns that the gradient b̄ of a sample, `unrolled` or λ of an adjoint solve, was made with another A of a Function
-/// than u was, as ⟨b̄, b⟩ and ⟨u, ū⟩ differ: once for this `code`.
-void warn_of_another_product(FunctionCode& code, bool unrolled, int64_t sample, double of_b, double of_u);
+/// Warns that ⟨λ, b⟩ and ⟨u, ū⟩ of a sample differ, so that a Function's adjoint solve was made with another A: once
+/// for this `code`.
+void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_solve, double of_adjoint);
+
+/// Warns that ‖b - A u‖/‖b‖ of a sample is not what it was when a Function was solved: once for this `code`.
+void warn_of_another_product(FunctionCode& code, int64_t sample, double now, double before);
 
 }  // namespace prdp
