@@ -254,7 +254,7 @@ def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Itera
             return ((product - here) * w).sum().item() / s
 
         above, below = changed(step), changed(-step)
-        if math.isnan(below):
+        if math.isnan(below):  # as of h < 0: two steps up in its place
             below = changed(step / 2)
         terms = torch.zeros_like(direction) if gradient is None else gradient * direction
         slope = terms.sum().item()
