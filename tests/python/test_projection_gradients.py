@@ -91,6 +91,19 @@ def test_project_and_pressure_have_them_too(name):
     assert gradcheck(both, used(name, inputs(name)))
 
 
+@pytest.mark.parametrize("solver", [EXACT, prdp.Direct()], ids=repr)
+@pytest.mark.parametrize("name", ["periodic", "walls", "3d"])
+def test_project_has_the_same_gradient_at_rest(name, solver):
+    """The map is affine. Nothing is solved where the divergence is zero, or less than a normal number."""
+    u, *others = inputs(name)
+    flow = make(name, *(t.detach()[:1] if t.dim() else t.detach() for t in others), solver=solver)
+    weights = random_velocity(CASES[name]["shape"], 1, seed=3)
+    at = torch.cat([0 * u[:1], u[:1], 1e-310 * u[:1]]).detach().requires_grad_()
+    (found,) = torch.autograd.grad((flow.project(at) * weights).sum(), at, create_graph=True)
+    torch.testing.assert_close(found[0], found[1], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(found[2], found[1], rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("diffusion", ["implicit", "explicit"])
 @pytest.mark.parametrize("name", CASES)
 def test_a_step_and_its_pressure_at_once(name, diffusion):

@@ -55,13 +55,13 @@ at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
 }
 
 /// Divergences that the dtype has no normal numbers for are rounding, and nothing to do: they are zero to the solve,
-/// which could not tell their mean from what rounding leaves of it.
+/// which could not tell their mean from what rounding leaves of it. Their derivative stays.
 at::Tensor flush_subnormals(const at::Tensor& b) {
   const double normal =
       b.scalar_type() == at::kFloat ? std::numeric_limits<float>::min() : std::numeric_limits<double>::min();
   const auto rows = largest_magnitude(b) < normal;
   if (b.is_cpu() && !at::isTensorSubclassLike(b) && !rows.any().item<bool>()) return b;
-  return cleared(b, rows);
+  return at::where(per_sample(rows, b), b - b.detach(), b);
 }
 
 at::Tensor masked(const at::Tensor& t, const at::Tensor& mask) { return mask.defined() ? t * mask : t; }
