@@ -224,14 +224,14 @@ def test_the_limit_is_a_positive_number(seconds):
 
 
 def test_an_adjoint_at_its_rounding_does_not_end_the_trials_of_the_forward_solve():
-    """Here the adjoint solve is STAGNATED after four cycles, while a forward solve is MAX_ITER and needs more."""
+    """Here the adjoint solve is STAGNATED after five cycles, while a forward solve is MAX_ITER and needs more."""
     generator = torch.Generator().manual_seed(0)
     kappa = (0.5 * torch.randn(1, 32, 32, generator=generator) - 3).exp()
     u = torch.randn(2, 1, 32, 32, generator=generator)
     diffusion = operators.Diffusion(kappa, shift=0.1, boundary=["flux", "periodic"])
     step, solver = prdp.ImplicitStep(diffusion, lambda u: u, prdp.Multigrid(1)), prdp.Multigrid(1)
     trial = solver_trials.Trial(step, u, torch.ones_like(u), False)
-    solver_trials.set_solver(step, solver, 4, 1e-5)
+    solver_trials.set_solver(step, solver, 5, 1e-5)
     cut = solver_trials.run(trial, solver)
     assert (cut.forward.cut_off, cut.adjoint.cut_off, cut.status) == (True, False, "STAGNATED") and cut.may_go_on
     assert [row.solved for row in solver_trials._measure_one(trial, solver, 5.0)] == [True, True]
