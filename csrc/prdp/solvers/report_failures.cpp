@@ -210,6 +210,10 @@ std::string failure_text(const Report& report, const std::vector<int64_t>& faile
   return text.str();
 }
 
+bool was_warned_of(FunctionCode& code) {
+  return code.warned_of_product.exchange(true) && !c10::WarningUtils::get_warnAlways();
+}
+
 }  // namespace
 
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
@@ -264,7 +268,7 @@ void warn_of_constant_cycles() {
 }
 
 void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_solve, double of_adjoint) {
-  if (code.warned_of_product.exchange(true) && !c10::WarningUtils::get_warnAlways()) return;
+  if (was_warned_of(code)) return;
   std::ostringstream text;
   text << "adjoint solve: the gradient of sample " << sample
        << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
@@ -276,7 +280,7 @@ void warn_of_another_transpose(FunctionCode& code, int64_t sample, double of_sol
 }
 
 void warn_of_another_product(FunctionCode& code, int64_t sample, double now, double before) {
-  if (code.warned_of_product.exchange(true) && !c10::WarningUtils::get_warnAlways()) return;
+  if (was_warned_of(code)) return;
   std::ostringstream text;
   text << "unrolled solve: the gradient of sample " << sample
        << " is wrong, as this Function is not the A that was solved: |b - A u| is " << three_digits(now)

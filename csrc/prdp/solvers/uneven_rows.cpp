@@ -124,8 +124,8 @@ at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const
   auto changes = share_of(further);
   if (!(changes.max() > look.much()).item<bool>()) return changes;
   const bool keeps_null_space = look.role.a.kind == "singular_diffusion";  // the constant, whatever κ
-  auto is_free = maps_constant_to_zero(a, look.b, /*transposed=*/false, /*jointly=*/true);
-  if (keeps_null_space) is_free.fill_(false);
+  auto is_free = keeps_null_space ? at::zeros({b.size(0)}, at::kBool)
+                                  : maps_constant_to_zero(a, look.b, /*transposed=*/false, /*jointly=*/true);
   if (keeps_null_space || !is_singular(look.role.a)) {
     const auto moved = share_of(go_on(epsilon_of(look.b)) - further + u);
     is_free = is_free.logical_or(sample_maxima(moved) > 0.3 * sample_maxima(changes));
