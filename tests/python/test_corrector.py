@@ -62,7 +62,7 @@ def test_the_scene_holds_the_papers_settings():
         ("seed = 0", "seed = 0\nmodes = 5", "modes", "data.modes: only for `emulator`, not with `file`"),
         ("cosine_updates = 800", "cosine_updates = 0", "cosine_up", "training.cosine_updates: must be >= 1, got 0"),
         ("cosine_updates = 800", "cosine_updates = 8\ndecay = 0.9", "decay = ", "training.decay: not for `parameters`"),
-        ("cosine_updates = 800", "", "[training]", "training.decay: missing; the table holds:"),
+        ("cosine_updates = 800", "", "[training]", "training.decay, training.decay_steps: missing; the table holds:"),
         ('"implicit"', '"jfb"', "backward", "unknown name 'jfb'; allowed: implicit, unrolled, none"),
         ('"corrector"', '"fixer"', "task =", "task: unknown name 'fixer'; allowed: emulator, corrector, parameters"),
     ],

@@ -88,6 +88,11 @@ def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, m
     assert_refused(written(tmp_path, (before, after)), where, message)
 
 
+def test_missing_keys_of_a_table_are_named_at_once(tmp_path):
+    scene = written(tmp_path, ("nu = 1e-3", ""), ("shape = [30]", ""), ("dt = 1.0", "dt = -1.0"))
+    assert_refused(scene, "[physics]", "physics.shape, physics.nu: missing; the table holds: dt, equation")
+
+
 def test_bicgstab_is_a_method_of_scenes_without_a_restart(tmp_path):
     solver = ('method = "gmres"\nrestart = 2             # Arnoldi steps in a cycle; a cycle is one iteration\n',
               'method = "bicgstab"\n')  # fmt: skip

@@ -143,7 +143,8 @@ bool warn_of_growth(const Report& report) {
     text << "stopped at max_iter = " << report.role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
          << " at " << report.residuals[worst] << ", where rtol = " << report.rtol() << " was asked for";
   };
-  report.warn("grown: ", grown.size(), worst, SolveStatus::kMaxIter, say, "; or rtol=0 if this is meant");
+  report.warn("grown: ", grown.size(), worst, SolveStatus::kMaxIter, say,
+              "; or rtol=0 if so few are meant, as by PRDPController");
   return true;
 }
 

@@ -65,7 +65,7 @@ class TomlSection {
   /// Reads an inner table by read(its section, scene).
   template <class Read>
   void section(Scene& scene, Read read, const Key& key) {
-    if (!given(key)) return;
+    if (!given(key)) return refuse_missing();
     const auto* inner = table_[key.name].as_table();
     if (!inner) fail(key.name, "expected a table");
     TomlSection section(*inner, file_, full(key.name));
@@ -87,7 +87,7 @@ class TomlSection {
   }
   template <class T, class FromName>
   void choice(T& target, FromName from_name, const Choices& choices, const Key& key) {
-    if (!given(key)) return;
+    if (!given(key)) return refuse_missing();  // which keys come next may depend on it
     const auto chosen = value<std::string>(key.name, "a string");
     std::ostringstream allowed;
     for (const auto& [name, when] : choices) {
@@ -168,13 +168,14 @@ class TomlSection {
       if (!(x > 0.0) || !std::isfinite(x)) fail(key.name, bound(">", 0.0, x) + " and be finite");
     if (std::all_of(target.begin(), target.end(), [](double x) { return x == 1.0; })) target.clear();
   }
-  /// A condition on what has been read already.
+  /// A condition on what has been read already. It waits until no key is missing.
   void check(bool holds, const char* key, const std::string& expected) const {
-    if (!holds) fail(key, expected);
+    if (!holds && missing_.empty()) fail(key, expected);
   }
 
-  /// Raises for keys that nobody asked for.
+  /// Raises for keys that are missing, and for those that nobody asked for.
   void finish() const {
+    refuse_missing();
     for (const auto& [key, node] : table_) {
       if (asked_.count(std::string(key.str()))) continue;
       if (const auto other = not_here_.find(std::string(key.str())); other != not_here_.end())
@@ -189,11 +190,20 @@ class TomlSection {
  private:
   std::string full(const std::string& key) const { return name_.empty() ? key : name_ + "." + key; }
   [[noreturn]] void fail(const char* key, const std::string& what) const {
+    refuse_missing();  // what was read may be wrong for want of them
     const auto* node = table_.get(key);
     const auto line = node ? node->source().begin.line : table_.source().begin.line;
     TORCH_CHECK_VALUE(false, file_, ":", line, ": ", full(key), ": ", what);
   }
-  /// Whether there is a value to read. Raises if the key applies, is not optional and is missing.
+  /// Raises if keys are missing, all in one message.
+  void refuse_missing() const {
+    if (missing_.empty()) return;
+    std::ostringstream present;
+    for (const auto& [key, node] : table_) present << (present.tellp() > 0 ? ", " : "") << key.str();
+    TORCH_CHECK_VALUE(false, file_, ":", table_.source().begin.line, ": ", c10::Join(", ", missing_),
+                      ": missing; the table holds: ", table_.empty() ? "nothing" : present.str());
+  }
+  /// Whether there is a value to read. If the key applies, is not optional and is missing, refuse_missing() raises.
   template <class T = void>
   bool given(const Key& key) {
     if (!key.when.holds) {
@@ -203,9 +213,8 @@ class TomlSection {
     asked_.insert(key.name);
     if (table_.contains(key.name)) return true;
     if (key.optional || is_optional<T>) return false;
-    std::ostringstream present;
-    for (const auto& [other, node] : table_) present << (present.tellp() > 0 ? ", " : "") << other.str();
-    fail(key.name, "missing; the table holds: " + (table_.empty() ? "nothing" : present.str()));
+    missing_.push_back(full(key.name));
+    return false;
   }
   double number(const char* key) const {
     const double x = value<double>(key, "a number");
@@ -250,6 +259,7 @@ class TomlSection {
   const toml::table& table_;
   std::string file_, name_;
   std::set<std::string> asked_;
+  std::vector<std::string> missing_;
   std::map<std::string, std::string> not_here_;  // keys of other scenes, and of which
 };
 
