@@ -57,7 +57,8 @@ def test_others_say_nothing(always):
     assert not said(lambda: step(start="state").rollout(WAVE, 7))[1]  # few steps
     assert not said(lambda: step(start="zero").rollout(WAVE, 100))[1]
     assert not said(lambda: step(start="state", on_failure="return").rollout(WAVE, 1000))[1]
-    assert not said(lambda: step(prdp.CG(100, rtol=1e-2), start="state").rollout(WAVE, 1000))[1]  # a controller's
+    loose = step(prdp.CG(100, rtol=3e-4), start="state")  # may be a controller's
+    assert not said(lambda: loose.rollout(WAVE, 5000))[1] and loose.info.iterations.eq(0).float().mean() > 0.9
     assert not said(lambda: step(start="state").rollout(torch.ones_like(WAVE), 1000))[1]  # nothing is left out
 
 
@@ -69,6 +70,24 @@ def test_a_march_towards_a_steady_state_says_nothing(always):
     states, told = said(lambda: march.rollout(torch.zeros(1, 1, N, dtype=F64), 100))
     assert (march.info.iterations[:, -50:] == 0).all() and not told
     assert (states[:, -1] - states[:, -2]).abs().max() == 0
+
+
+@pytest.mark.parametrize("rtol", [1e-5, 3e-5, 1e-4, 1e-3])
+def test_a_cable_that_a_current_lifts_is_told_at_every_tolerance(rtol, always):
+    """At rest at -65: the change of a step is far below the state. At 1e-5 one step in nine works, the first among
+    them; at 1e-3 none does."""
+    n, dt, rest = 100, 0.025, -65.0
+    cable = prdp.operators.Diffusion(torch.full((1, n), 0.5, dtype=F64), 1 / dt + 0.1, boundary="flux", length=40.0)
+    current = torch.zeros(1, 1, n, dtype=F64)
+    current[..., :3] = 0.5
+    start = torch.full((1, 1, n), rest, dtype=F64)
+    lift = {}
+    for begin in ("zero", "state"):
+        march = prdp.ImplicitStep(cable, lambda u: u / dt + 0.1 * rest + current, prdp.CG(500, rtol), start=begin)
+        states, told = said(lambda march=march: march.rollout(start, 1600))
+        lift[begin] = float(states[0, -1, 0, 0]) - rest
+        assert len(told) == (begin == "state")
+    assert lift["state"] < 0.7 * lift["zero"]
 
 
 def test_it_is_said_once():
