@@ -152,6 +152,25 @@ def test_ctrl_c_keeps_what_is_finished_and_exits_130(tmp_path, command):
     assert not list(tmp_path.rglob("*.part"))
 
 
+def test_prdp_train_ends_soon_while_data_are_made_and_its_log_can_be_followed(tmp_path):
+    scene = tmp_path / "slow.toml"  # its data take minutes
+    text = (ROOT / "examples/scenes/burgers_2d.toml").read_text()
+    scene.write_text(re.sub(r"shape = \[\d+, \d+\]", "shape = [192, 192]", text))
+    with open(tmp_path / "log", "w") as log:
+        process = subprocess.Popen([TRAINER, scene, "--out", tmp_path], stdout=log, stderr=subprocess.PIPE)
+    for _ in range(600):
+        if (tmp_path / "log").read_text():
+            break
+        time.sleep(0.1)
+    time.sleep(1)
+    assert process.poll() is None and (tmp_path / "log").read_text().startswith("slow: auto, ")
+    begin = time.monotonic()
+    process.terminate()
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM and b"interrupted" in errors
+    assert time.monotonic() - begin < 5
+
+
 @pytest.mark.parametrize("full", [False, True])
 def test_work_goes_on_where_nobody_takes_the_output(tmp_path, full):
     """As `prdp compare … | head`, and with a disk that is full."""

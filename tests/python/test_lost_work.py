@@ -93,6 +93,26 @@ def test_finished_records_that_are_replaced_are_told_before(tmp_path):
     assert prdp(*train) == (0, f"prdp: replaces when it ends: '{record}', which is damaged\n")
 
 
+def test_prdp_train_tells_of_them_too(tmp_path):
+    scene = written(tmp_path, *SHORT)
+    record = tmp_path / "auto/seed_0.json"
+
+    def said(*more):
+        done = subprocess.run(
+            [TRAINER, scene, "--intervals", "1", "--out", tmp_path, *more], capture_output=True, text=True, check=True
+        )
+        return done.stderr
+
+    told = "prdp_train: replaces when it ends: "
+    assert said() == said("--resume") == ""
+    assert said() == f"{told}'{record}', of the same settings\n"
+    other = "--resume", "--backward", "unrolled"
+    assert said(*other, "--seeds", "2") == f"{told}'{record}', of other settings\n"
+    assert said("--seeds", "2") == f"{told}'{record}', of other settings, and 1 more\n"
+    record.write_text("damaged")
+    assert said() == f"{told}'{record}', which is damaged\n"
+
+
 def test_of_files_that_differ_it_is_said_which():
     there, here = (
         {"data": "1f", "network": "2a", "backward": "none"},

@@ -132,19 +132,23 @@ bool later_iterations_were_worse(const Report& report, int64_t sample) {
   return max_iter > 0 && (iterations == 0 || (max_iter >= many_iterations && iterations < max_iter / 2));
 }
 
-/// Of samples that max_iter left with a residual above ‖b‖. That is no failure, as an error may fall where its residual
-/// grows, but whoever asked for a tolerance did not mean it. Returns whether there are any.
+/// Of samples that max_iter left with a residual above ‖b‖, or a direct method with a large one. That is no failure, as
+/// an error may fall where its residual grows, but whoever asked for a tolerance did not mean it. Returns whether there
+/// are any.
 bool warn_of_growth(const Report& report) {
+  const bool is_direct = traits(report.role.solver.method).is_direct;
+  const double bound = is_direct ? report.large_residual() : 1.0;
   const auto grown = report.samples_where(
-      [&](int64_t i) { return report.status(i) == SolveStatus::kMaxIter && report.residuals[i] > 1.0; });
+      [&](int64_t i) { return report.status(i) == SolveStatus::kMaxIter && report.residuals[i] > bound; });
   if (grown.empty()) return false;
   const int64_t worst = report.worst_of(grown);
   const auto say = [&](std::ostream& text) {
-    text << "stopped at max_iter = " << report.role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
-         << " at " << report.residuals[worst] << ", where rtol = " << report.rtol() << " was asked for";
+    text << "stopped at max_iter = " << report.role.solver.max_iter << ", with a "
+         << (is_direct ? "large residual" : "residual above ‖b‖") << ": sample " << worst << " at "
+         << report.residuals[worst] << ", where rtol = " << report.rtol() << " was asked for";
   };
-  report.warn("grown: ", grown.size(), worst, SolveStatus::kMaxIter, say,
-              "; or rtol=0 if so few are meant, as by PRDPController");
+  const char* const end = is_direct ? "" : "; or rtol=0 if so few are meant, as by PRDPController";
+  report.warn("grown: ", grown.size(), worst, SolveStatus::kMaxIter, say, end);
   return true;
 }
 

@@ -56,6 +56,17 @@ std::vector<Checkpoint::Found> Checkpoint::find() {
   return found;
 }
 
+void Checkpoint::refuse_other(const fs::path& record) const {
+  remove_before(record);
+  for (const auto& path : {path_, before_}) {
+    const auto opened = open_sealed(path, kKind);
+    TORCH_CHECK_VALUE(!opened || !opened->sealed || opened->sealed->settings == settings_, "checkpoint: '",
+                      path.string(),
+                      "' is of a training that has not ended, with other settings or of another version; give its "
+                      "settings and --resume to go on with it, or another --out, or delete the file");
+  }
+}
+
 void Checkpoint::refuse_to_lose(const fs::path& record) {
   remove_before(record);
   std::vector<Found> found;

@@ -47,6 +47,9 @@ class Checkpoint {
   void remove() const;
   /// Removes them if they are older than the record of their training: a kill came between the two.
   void remove_before(const std::filesystem::path& record) const;
+  /// Raises ValueError for a state of other settings, or of another version, that is not older than the record: it
+  /// would be overwritten.
+  void refuse_other(const std::filesystem::path& record) const;
   /// Raises ValueError if there is a state to go on from that is not older than the record: a training from the start
   /// would lose it.
   void refuse_to_lose(const std::filesystem::path& record);

@@ -261,7 +261,8 @@ void read_compare(Section& s, Scene& scene) {
   s.above(c.target, 0.0, {"target", "iterations are counted only until the metric reaches this value"});
   s.wholes(c.schedule, 0,
            {.name = "schedule",
-            .means = "two numbers, adds a row: K starts at the first and grows by the second in each interval",
+            .means = "two numbers, adds a row: K is their sum in the first interval, and grows by the second in each "
+                     "that follows",
             .unit = "iterations",
             .optional = true});
   s.check(c.schedule.empty() || c.schedule.size() == 2, "schedule", "expected two whole numbers, start and step");

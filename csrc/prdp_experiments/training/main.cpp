@@ -7,11 +7,14 @@
 #include <charconv>
 #include <csignal>
 #include <cstdio>
+#include <exception>
 #include <filesystem>
 #include <thread>
 #include <utility>
+#include <vector>
 
 #include "prdp/error_text.h"
+#include "prdp/threads/interruption.h"
 #include "prdp_experiments/files/record.h"
 #include "prdp_experiments/files/seal.h"
 #include "prdp_experiments/files/whole_files.h"
@@ -24,8 +27,11 @@ namespace {
 using prdp::Json;
 namespace fs = std::filesystem;
 
-volatile std::sig_atomic_t interrupted = 0;
-struct Interrupted {};
+volatile std::sig_atomic_t interrupted = 0;  // the signal
+struct Interrupted : std::exception {};     // so that it passes through a backward pass
+void stop_if_interrupted() {
+  if (interrupted) throw Interrupted{};
+}
 
 struct Options {
   std::string scene, out, schedule, backward, weights, device;
@@ -107,6 +113,39 @@ bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& c
   return false;
 }
 
+/// What a training puts in the place of a finished record; empty if there is none, or it is kept.
+std::string replaced_by(const Identity& identity, const fs::path& path, bool resume) {
+  try {
+    const auto kept = prdp::read_training(path);
+    if (!kept) return {};
+    auto found = kept->at("settings");
+    const bool as_long = found.at("intervals").get<int64_t>() == identity.scene.training.intervals;
+    found.erase("intervals");
+    const bool same = found == identity.settings();
+    if (same && resume) return {};
+    return "'" + path.string() + (same && as_long ? "', of the same settings" : "', of other settings");
+  } catch (const c10::Error&) {  // with --resume, who reads it says so
+    return resume ? "" : "'" + path.string() + "', which is damaged";
+  }
+}
+
+/// Throws where one of these trainings would overwrite a checkpoint: of other settings, or of its own where it begins
+/// anew. Finished records that will be replaced are told on stderr.
+template <class FileOf>
+void refuse_to_lose(const Options& options, const Identity& identity, const std::string& label, const FileOf& file_of) {
+  std::vector<std::string> replaced;
+  for (int64_t seed = 0; seed < options.seeds; ++seed) {
+    const auto file = file_of(seed);
+    auto checkpoint = checkpoint_of(file, identity, label, seed);
+    checkpoint.refuse_other(file);
+    if (!options.resume) checkpoint.refuse_to_lose(file);
+    if (auto said = replaced_by(identity, file, options.resume); !said.empty()) replaced.push_back(std::move(said));
+  }
+  if (replaced.empty()) return;
+  const auto others = replaced.size() > 1 ? ", and " + std::to_string(replaced.size() - 1) + " more" : "";
+  std::fprintf(stderr, "prdp_train: replaces when it ends: %s%s\n", replaced.front().c_str(), others.c_str());
+}
+
 std::pair<int64_t, int64_t> parse_schedule(const std::string& text) {
   const char *begin = text.data(), *end = begin + text.size();
   std::pair<int64_t, int64_t> schedule{};
@@ -154,8 +193,7 @@ int run(const Options& options, const std::string& command) {
 
   std::printf("%s: %s, %s\n", scene.name.c_str(), refinement.label.c_str(), scene.title.c_str());
   const auto file_of = [&](int64_t seed) { return folder / ("seed_" + std::to_string(seed) + ".json"); };
-  for (int64_t seed = 0; !options.resume && seed < options.seeds; ++seed)
-    checkpoint_of(file_of(seed), identity, refinement.label, seed).refuse_to_lose(file_of(seed));
+  refuse_to_lose(options, identity, refinement.label, file_of);
   int diverged = 0;
   for (int64_t seed = 0; seed < options.seeds; ++seed) {
     const auto file = file_of(seed);
@@ -164,12 +202,12 @@ int run(const Options& options, const std::string& command) {
     if (options.resume && is_done(file, identity, checkpoint)) continue;
     if (!options.resume) checkpoint.remove();
     const auto on_interval = [&, first = true](int64_t done, double metric, int64_t k) mutable {
-      if (interrupted) throw Interrupted{};
+      stop_if_interrupted();
       if (std::exchange(first, false) || done % 10 == 0)
         std::printf("seed %ld  interval %4ld  metric %.4e  K %ld\n", seed, done, metric, k);
     };
     const auto on_data = [slow = !scene.physics.direct_is_cheap()](int64_t done, int64_t total) {
-      if (interrupted) throw Interrupted{};
+      stop_if_interrupted();
       if (slow) std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
     };
     const auto curves = prdp::train::train(scene, refinement, seed, options.weights, on_interval, checkpoint, on_data);
@@ -218,7 +256,9 @@ int main(int argc, char** argv) {
   } catch (const CLI::ParseError& error) {
     return app.exit(error) == 0 ? 0 : 2;
   }
-  std::signal(SIGINT, [](int) { interrupted = 1; });
+  for (const int signal : {SIGINT, SIGTERM}) std::signal(signal, [](int got) { interrupted = got; });
+  prdp::interruption::set_check(stop_if_interrupted);
+  std::setvbuf(stdout, nullptr, _IOLBF, BUFSIZ);  // a log can be followed
   std::string command;
   for (int i = 0; i < argc; ++i) command += (i ? " " : "") + std::string(argv[i]);
 
@@ -228,7 +268,7 @@ int main(int argc, char** argv) {
     std::fprintf(stderr,
                  "prdp_train: interrupted; --resume keeps finished trainings and goes on from the "
                  "last checkpoint\n");
-    return 130;
+    return 128 + interrupted;
   } catch (const c10::Error& error) {
     std::fprintf(stderr, "prdp_train: %s\n", prdp::sentence(error.what_without_backtrace()).c_str());
   } catch (const std::exception& error) {
