@@ -16,6 +16,7 @@ class HoldsTensors(torch.nn.Module):
 
     def _hold(self, name: str, value: object) -> None:
         """Make it state, in place of what is there. Whoever is interrupted leaves the old one or the new one."""
+        lent = self._lent()
         is_parameter, is_buffer = isinstance(value, torch.nn.Parameter), value is None or isinstance(value, Tensor)
         if not hasattr(self, name) and is_parameter:
             return self.register_parameter(name, cast(torch.nn.Parameter, value))
@@ -24,7 +25,7 @@ class HoldsTensors(torch.nn.Module):
         new: dict[str, Any] = self._parameters if is_parameter else self._buffers if is_buffer else vars(self)
         new[name] = value
         self._non_persistent_buffers_set.discard(name)
-        for place in (self._buffers, self._parameters, self._lent(), vars(self)):
+        for place in (self._buffers, self._parameters, lent, vars(self)):
             if place is not new:
                 place.pop(name, None)
 
@@ -36,10 +37,17 @@ class HoldsTensors(torch.nn.Module):
         self._lent().setdefault(name, [vars(self)[name]] if name in vars(self) else [])
         vars(self)[name] = value
 
+    def _held(self, name: str) -> Any:
+        """What it is now. A compiled graph asks whether it was set for the next steps, as it guards only what it read:
+        a Parameter that an attribute hides is still there."""
+        return vars(self)[name] if name in self._lent_tensors else getattr(self, name)
+
     def _lent(self) -> dict[str, list[Any]]:
         """The names of what was set for the next steps, with the attribute that it replaces, if it is one."""
         lent: dict[str, list[Any]] = vars(self).setdefault("_lent_tensors", {})
         return lent
+
+    _lent_tensors: dict[str, list[Any]]
 
     def __getstate__(self) -> dict[str, Any]:
         """What copies and pickles hold."""

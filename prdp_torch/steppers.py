@@ -161,7 +161,7 @@ class EquationStepper(HoldsTensors, Stepper):
 
     def _tensors(self) -> list[Tensor]:
         """What the operator is made of beside the state: nu as it is now."""
-        nu = self.nu
+        nu = self._held("nu")
         if isinstance(nu, torch.Tensor):
             return [nu]
         if torch_private.modes_are_active():

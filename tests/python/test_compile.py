@@ -196,3 +196,31 @@ def test_steppers_that_are_alike_share_a_graph(no_log, name, use):
         torch.testing.assert_close(u.grad, v.grad, rtol=1e-12, atol=0)
         assert torch.equal(step.adjoint_info.iterations, eager.adjoint_info.iterations)
     assert COUNTER.frame_count == 1
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # torch hides it from users
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+@pytest.mark.parametrize("use", ["step", "rollout"])
+def test_a_compiled_step_follows_what_nu_is_set_to(use, backend):
+    """A tensor that is set for the next steps hides a Parameter, which stays."""
+    torch._dynamo.reset()
+    w = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
+    make = {
+        "number": lambda: 0.02,
+        "Parameter": lambda: torch.nn.Parameter(torch.tensor(0.03, dtype=torch.float64)),
+        "output": lambda: 2 * w,
+        "buffer": lambda: torch.nn.Buffer(torch.tensor(0.04, dtype=torch.float64)),
+    }
+    step = prdp.Heat((8,), make["Parameter"](), 0.3, prdp.CG(500, rtol=1e-10))
+    compiled = torch.compile(lambda u: USES[use](step, u), backend=backend)
+    u = field((8,)).detach()
+    compiled(u)
+    for kind in ("output", "Parameter", "number", "output", "buffer", "output", "number", "Parameter"):
+        found = []
+        for call in (compiled, lambda u: USES[use](step, u)):
+            step.nu = make[kind]()
+            y = call(u)
+            inputs = [w] if kind == "output" else [step.nu] if kind == "Parameter" else [NETWORK.weight]
+            found.append([y, *torch.autograd.grad(y.square().sum(), inputs)])
+        for compiled_one, eager_one in zip(*found, strict=True):
+            torch.testing.assert_close(compiled_one, eager_one, rtol=1e-10, atol=0)

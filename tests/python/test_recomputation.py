@@ -34,6 +34,27 @@ def living(shape):
         return sum(isinstance(o, torch.Tensor) and o.shape == shape for o in gc.get_objects())
 
 
+@pytest.mark.parametrize("reused", [False, True])
+@pytest.mark.parametrize("method", [prdp.GMRES, prdp.CG, prdp.BiCGStab])
+def test_a_function_may_be_looked_at_in_one_of_the_two_passes_alone(method, reused):
+    """Its product is recorded to look at it in the 1st, 2nd, 4th, … solve: torch counts the tensors that are saved."""
+    a, b = torch.rand(1, 5, requires_grad=True), torch.randn(2, 1, 5, requires_grad=True)
+
+    def product(v, a):
+        return (2 + a.exp()) * v
+
+    kept = prdp.operators.Function(product, product, tensors=[a])
+
+    def solve(a, b):
+        of = kept if reused else prdp.operators.Function(product, product, tensors=[a])
+        return prdp.linear_solve(of, b, method(20))[0]
+
+    expected = torch.autograd.grad(solve(a, b).sum(), (a, b))
+    for _ in range(20):
+        found = torch.autograd.grad(checkpoint(solve, a, b, use_reentrant=False).sum(), (a, b))
+        assert all(map(torch.equal, found, expected))
+
+
 @pytest.mark.parametrize("use_reentrant", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_a_recomputed_rollout_leaves_nothing_behind(name, use_reentrant):

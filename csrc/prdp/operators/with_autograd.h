@@ -1,5 +1,6 @@
 #pragma once
 #include <ATen/ATen.h>
+#include <ATen/SavedTensorHooks.h>
 #include <ATen/core/grad_mode.h>
 #include <c10/core/InferenceMode.h>
 #include <torch/csrc/autograd/autograd.h>
@@ -21,6 +22,15 @@ auto with_autograd(const Body& body) {
   const at::AutoGradMode record(true);
   return body();
 }
+
+/// For a product that is recorded to look at it, and thrown away: hooks of saved tensors do not see it.
+/// torch.utils.checkpoint counts what they see, and a repetition may have nothing to look at.
+struct UnseenByHooks {
+  const bool before = at::SavedTensorDefaultHooks::set_tracing(true);
+  UnseenByHooks() = default;
+  UnseenByHooks(const UnseenByHooks&) = delete;
+  ~UnseenByHooks() { at::SavedTensorDefaultHooks::set_tracing(before); }
+};
 
 /// grad() of torch: a gradient in the place of each input, undefined where `needed` holds 0 or there is none. Outputs
 /// without a gradient or a cotangent contribute nothing.
