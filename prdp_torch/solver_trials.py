@@ -134,7 +134,8 @@ def candidates(step: Stepper) -> list[Solver]:
     every += [GMRES(1, restart=m) for m in restarts]
     kind = getattr(step, "kind", None)
     if kind not in ("heat", "poisson", "navier_stokes"):  # whose diagonals are constant
-        every += [CG(1, preconditioner="diagonal"), GMRES(1, restart=8, preconditioner="diagonal")]
+        every += [CG(1, preconditioner="diagonal"), BiCGStab(1, preconditioner="diagonal")]
+        every += [GMRES(1, restart=8, preconditioner="diagonal")]
     every += [Multigrid(1), CG(1, preconditioner="multigrid"), BiCGStab(1, preconditioner="multigrid")]
     return [*every, GMRES(1, restart=8, preconditioner="multigrid"), Direct(1)]
 

@@ -121,15 +121,17 @@ bool maps_ones_to_zero(const FailedSample& sample) {
   return m.defined() && !m.any().item<bool>();
 }
 
+const char* how_to_name() { return in_language(" (nullspace)", " (prdp::with_null_space)"); }
+
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const FailedSample& sample) {
   if (sample.is_single() && row_sums_are_rounding(sample))
     return "what keeps A from being singular, such as its shift, is lost in the rounding of float32; take float64";
   if (auto found = asymmetric(sample); !found.empty()) return found;
   return c10::str("A is symmetric but not definite to ", sample.precision(),
-                  ": take MINRES if it is indefinite, name all its null vectors (nullspace) if it is singular, and "
-                  "take ",
-                  sample.is_single() ? "float64" : "Direct", " if it is ill-conditioned");
+                  ": take MINRES if it is indefinite, name all its null vectors", how_to_name(),
+                  " if it is singular, and take ", sample.is_single() ? "float64" : "Direct",
+                  " if it is ill-conditioned");
 }
 
 /// Why MINRES finds no direction.
@@ -144,7 +146,7 @@ std::string minres_breakdown(const FailedSample& sample) {
   return "A is singular, and b lies outside its range; take a b without that part";
 }
 
-constexpr const char* kNullVectors = ". If A is singular, name all its null vectors (nullspace)";
+std::string if_singular() { return c10::str(". If A is singular, name all its null vectors", how_to_name()); }
 constexpr const char* kLostCoarseGrids =
     "in float32 its coarse grids may lose what keeps A from being singular; take CG with multigrid, Direct or float64";
 
@@ -166,7 +168,7 @@ std::string diverged(const FailedSample& sample) {
       if (loses_coarse_grids(sample)) return c10::str("the residual grew beyond 1e13 ‖b‖: ", kLostCoarseGrids);
       return c10::str(
           "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct",
-          kNullVectors);
+          if_singular());
   }
 }
 
@@ -234,7 +236,7 @@ std::string stagnated(const FailedSample& sample) {
   if (sample.method().counts == Counts::kCycles)
     return c10::str("its cycles take nothing more off the residual; take a larger restart, ",
                     multigrid ? "no multigrid" : "a preconditioner", ", or Direct", single ? ", or float64" : "",
-                    kNullVectors);
+                    if_singular());
   const char* another = method == Method::kDirect ? "take an iterative method"
                         : multigrid               ? "take another preconditioner than multigrid, or Direct"
                                                   : "take another preconditioner or Direct";
@@ -287,8 +289,8 @@ std::string zero_diagonal(const FailedSample& sample) {
 std::string nonfinite_input(const FailedSample& sample) {
   if (all_finite(sample.of(sample.b))) return "the start is NaN or Inf there; take another one, or none";
   if (sample.role.adjoint)
-    return "the cotangent is NaN or Inf there; look at the loss, at the scale of a GradScaler, or at the steps after "
-           "this one";
+    return "the cotangent is NaN or Inf there; look at the loss" +
+           std::string(in_language(", at the scale of a GradScaler,", "")) + " or at the steps after this one";
   return "the right-hand side is NaN or Inf there; look at the state that it is made of";
 }
 

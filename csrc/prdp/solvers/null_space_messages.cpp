@@ -46,9 +46,14 @@ std::string remedy_by_naming(const FailedSample& sample) {
                   c10::Join(", ", b.sizes().slice(1)), ")", in_language("", ")"), " in the dtype of b");
 }
 
+/// A small shift may make A regular, and be rounding beside the rest of the diagonal.
+const char* or_lost_shift(const FailedSample& sample) {
+  return sample.b.scalar_type() == at::kFloat ? "; if a shift is to hold it, float32 has lost that: take float64" : "";
+}
+
 /// Where nobody named the null space.
 std::string inconsistent_unnamed(const FailedSample& sample) {
-  const auto remedy = remedy_by_naming(sample);
+  const auto remedy = remedy_by_naming(sample) + or_lost_shift(sample);
   if (sample.role.adjoint)
     return "the cotangent has a constant part, which Aᵀ cannot reach, as A maps the constant to zero; " + remedy;
   return "b has a constant part, which A cannot reach, as Aᵀ maps the constant to zero; take the mean off b, and " +
@@ -68,7 +73,7 @@ std::string undeclared_null_space(const FailedSample& sample) {
   const bool adjoint = sample.role.adjoint;
   if (!maps_constant(sample, adjoint ? Of::kItsTranspose : Of::kForwardA, Constant::kOfAllChannels)) return {};
   return c10::str(adjoint ? "Aᵀ" : "A", " maps the constant to zero, so ", adjoint ? "A" : "it", " is singular; ",
-                  remedy_by_naming(sample));
+                  remedy_by_naming(sample), or_lost_shift(sample));
 }
 
 std::string inconsistent(const FailedSample& sample) {

@@ -249,9 +249,11 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
 void warn_of_lost_cotangents(const std::string& who, int64_t lost, int64_t batch) {
   warn_once("cotangents", 0.0, [&](std::ostream& text) {
     text << who << ": the cotangent of " << lost << " of " << batch
-         << " samples contains NaN or Inf, and their gradient is zero. A GradScaler cannot see that: take bfloat16 "
-            "without one, or a small scale that stays"
-         << in_language(", such as GradScaler(init_scale=256.0, growth_interval=10**9)", "");
+         << " samples contains NaN or Inf, and their gradient is zero"
+         << in_language(
+                ". A GradScaler cannot see that: take bfloat16 without one, or a small scale that stays, such "
+                "as GradScaler(init_scale=256.0, growth_interval=10**9)",
+                "");
   });
 }
 

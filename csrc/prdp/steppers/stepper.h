@@ -28,6 +28,7 @@ class StepperBase {
   int64_t max_iter() const { return options_.solver.max_iter.expect_int(); }
   void set_max_iter(int64_t k);
   SolveOptions& options() { return options_; }
+  const SolveOptions& options() const { return options_; }
 
   /// The report of the last step or rollout; nothing before the first.
   const std::optional<SolveInfo>& info() const { return info_; }

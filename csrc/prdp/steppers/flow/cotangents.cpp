@@ -24,8 +24,8 @@ void report_nonfinite(const at::Tensor& bar, const at::Tensor& refused, OnFailur
   const auto first = samples[0].item<int64_t>();
   raise_or_warn(c10::str("Flow: adjoint step: ", samples.size(0), " of ", bar.size(0), " samples failed: sample ",
                          first, " NONFINITE_INPUT at index ", as_tuple(first_true(nonfinite(bar[first]))),
-                         ": the cotangent is NaN or Inf there; look at the loss, at the scale of a GradScaler, or at "
-                         "the steps after this one"),
+                         ": the cotangent is NaN or Inf there; look at the loss",
+                         in_language(", at the scale of a GradScaler,", ""), " or at the steps after this one"),
                 on_failure);
 }
 
