@@ -14,3 +14,4 @@
 #include "prdp/steppers/flow/flow.h"
 #include "prdp/steppers/implicit_step.h"
 #include "prdp/steppers/steppers.h"
+#include "prdp/threads/interruption.h"

@@ -1,7 +1,7 @@
 /// Trains a network through a heat step in C++: what the network makes of u0 shall, after one step of the solver,
 /// be where two steps lead. PRDP begins with one iteration per solve and adds more as the error stops falling.
-#include <prdp_experiments/networks/mlp.h>
 #include <prdp/prdp.h>
+#include <prdp_experiments/networks/mlp.h>
 #include <torch/optim/adam.h>
 
 #include <iostream>
@@ -30,8 +30,9 @@ void train() {
     const auto metric = ((exact(network->forward(u0)) - wanted).norm() / wanted.norm()).item<double>();
     if (epoch % 10 == 0 || epoch + 1 == kEpochs)
       std::cout << "epoch " << epoch << ": error " << metric << ", K = " << heat.max_iter() << '\n';
-    if (controller.step(metric, heat.converged())) heat.set_max_iter(controller.max_iter());
+    if (controller.step(metric, prdp::last_solves({&heat}))) prdp::set_budget(heat, controller.budget());
   }
+  if (const auto warning = controller.warning()) std::cout << *warning << '\n';
 }
 
 }  // namespace
