@@ -102,8 +102,10 @@ def test_a_residual_above_b_is_told_of_steps_and_of_adjoint_solves():
         step(rough)
         step(rough)
     assert float(step.info.residual) > 1 and "linear_solve: 1 of 1 samples stopped at max_iter = 30" in words[0]
-    assert words[0].endswith("take more iterations, a preconditioner, GMRES or Direct; or rtol=0 if so few are meant, "
-                             "as by PRDPController. This is said once, and again if it gets ten times worse")  # fmt: skip
+    assert words[0].endswith(
+        "take more iterations, a preconditioner, GMRES or Direct; or rtol=0 if so few are meant, "
+        "as by PRDPController. This is said once, and again if it gets ten times worse"
+    )
     b = (a @ torch.sin(3 * x)).requires_grad_()
     u, info = prdp.linear_solve(a, b, prdp.CG(30, rtol=1e-3))
     with told("above ‖b‖") as words:
