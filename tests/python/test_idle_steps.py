@@ -62,12 +62,13 @@ def test_others_say_nothing(always):
     assert not said(lambda: step(start="state").rollout(torch.ones_like(WAVE), 1000))[1]  # nothing is left out
 
 
-def test_a_march_towards_a_steady_state_says_nothing(always):
+@pytest.mark.parametrize("solver", [prdp.CG(100), prdp.CG(100, rtol=1e-4), prdp.CG(100, preconditioner="multigrid")])
+@pytest.mark.parametrize("steps", [100, 1000])
+def test_a_march_towards_a_steady_state_says_nothing(solver, steps, always):
+    """It is there after a few steps, and rests for the others."""
     kappa = torch.ones(1, N, dtype=F64)
-    march = prdp.ImplicitStep(
-        prdp.operators.Diffusion(kappa, shift=1.0), lambda u: u + 1.0, prdp.CG(100), start="state"
-    )
-    states, told = said(lambda: march.rollout(torch.zeros(1, 1, N, dtype=F64), 100))
+    march = prdp.ImplicitStep(prdp.operators.Diffusion(kappa, shift=1.0), lambda u: u + 1.0, solver, start="state")
+    states, told = said(lambda: march.rollout(torch.zeros(1, 1, N, dtype=F64), steps))
     assert (march.info.iterations[:, -50:] == 0).all() and not told
     assert (states[:, -1] - states[:, -2]).abs().max() == 0
 

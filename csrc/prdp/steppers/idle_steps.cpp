@@ -13,8 +13,7 @@ namespace prdp {
 
 namespace {
 
-/// Of each sample, whether the steps before its last iteration were mostly idle. A march towards a steady state works
-/// before it rests.
+/// Of each sample, whether the steps before its last iteration were mostly idle.
 at::Tensor creeps(const at::Tensor& idle, const at::Tensor& iterations, const at::Tensor& left_out, double much) {
   const auto worked = iterations.gt(0).to(at::kLong);
   const auto before_last = worked.flip({1}).cumsum(1).flip({1}).gt(0);  // there is work in this step or a later one
@@ -41,7 +40,9 @@ void warn_of_idle_steps(const SolveInfo& info, double rtol, OnFailure on_failure
   const auto left_out = residual.masked_fill(idle.logical_not(), 0.0);
   const auto of_all = left_out.sum(1);
   const auto first = idle.narrow(1, 0, std::max(fewest_steps, steps / 10)).to(at::kDouble).mean(1).gt(0.5);
-  const auto stands = rtol > loose ? iterations.eq(0).all(1) : first;
+  // A march towards a steady state begins far from it, and works before it rests.
+  const auto begins_near = iterations.select(1, 0).le(1);
+  const auto stands = rtol > loose ? iterations.eq(0).all(1) : first.logical_and(begins_near);
   auto rests = stands.logical_and(of_all.gt(much));
   if (!(rtol > loose)) rests = rests.logical_or(creeps(idle, iterations, left_out, much));
   if (!rests.any().item<bool>()) return;
