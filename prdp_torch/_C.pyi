@@ -172,7 +172,7 @@ def warn(text: str) -> None:
     """
     Warn, at the line of the user's that led here.
     """
-def warn_of_idle_steps(iterations: torch.Tensor, residual: torch.Tensor, status: torch.Tensor, rtol: typing.SupportsFloat | typing.SupportsIndex, on_failure: str) -> None:
+def warn_of_idle_steps(iterations: torch.Tensor, residual: torch.Tensor, status: torch.Tensor, rtol: typing.SupportsFloat | typing.SupportsIndex, has_controller: bool, on_failure: str) -> None:
     """
     Warn where the steps of a rollout, (batch, steps), hand their start on.
     """

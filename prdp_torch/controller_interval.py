@@ -24,6 +24,12 @@ def all_converged(steppers: list[Refinable]) -> bool:
 _LAST: "weakref.WeakKeyDictionary[Any, weakref.ref[Any]]" = weakref.WeakKeyDictionary()  # who set a stepper last
 
 
+def has_controller(stepper: torch.nn.Module) -> bool:
+    """Whether a controller that lives sets it."""
+    last = _LAST.get(stepper)
+    return last is not None and last() is not None
+
+
 def take_over(steppers: list[Refinable], controller: object) -> str | None:
     """Note who sets these steppers now. What to say if another controller has set one since this one did; else None."""
     said = None

@@ -12,6 +12,7 @@ from torch import Tensor
 from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.batching import outlive_transforms
 from prdp_torch.calls import forgets_if_it_raises
+from prdp_torch.controller_interval import has_controller
 from prdp_torch.operators.base import full_precision
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import AdjointLog, AdjointLogs, LogOfRollout, SolveInfo, SolveStatus, linear_solve
@@ -217,7 +218,7 @@ class Stepper(HasSettings):
             self._last_log = log
         kept = None if report is None else outlive_transforms(report)
         if kept is not None and kept[0].dim() == 2 and not compiling:
-            _C.warn_of_idle_steps(*kept[:3], self.rtol, self.on_failure)
+            _C.warn_of_idle_steps(*kept[:3], self.rtol, has_controller(self), self.on_failure)
         if kept is None:
             info = None
         else:  # if nothing was solved, way_of_last_solve() would describe an earlier solve

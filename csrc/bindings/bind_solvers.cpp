@@ -228,12 +228,12 @@ void bind_solvers(py::module_& m) {
   m.def(
       "warn_of_idle_steps",
       [](const at::Tensor& iterations, const at::Tensor& residual, const at::Tensor& status, double rtol,
-         const std::string& on_failure) {
+         bool has_controller, const std::string& on_failure) {
         const SolveInfo info{iterations, residual, status, iterations, residual};
-        warn_of_idle_steps(info, rtol, on_failure_from_name(on_failure));
+        warn_of_idle_steps(info, rtol, has_controller, on_failure_from_name(on_failure));
       },
-      py::arg("iterations"), py::arg("residual"), py::arg("status"), py::arg("rtol"), py::arg("on_failure"),
-      "Warn where the steps of a rollout, (batch, steps), hand their start on.");
+      py::arg("iterations"), py::arg("residual"), py::arg("status"), py::arg("rtol"), py::arg("has_controller"),
+      py::arg("on_failure"), "Warn where the steps of a rollout, (batch, steps), hand their start on.");
   m.def("check_start", [](const std::string& start) { start_from_name(start); }, py::arg("start"));
   m.def("way_of_last_solve", &way_of_last_solve,
         "How this thread's last solve was computed: kernel, loops or tensors.");

@@ -189,6 +189,15 @@ def test_work_goes_on_where_nobody_takes_the_output(tmp_path, full):
     assert (run / "report.html").exists()
 
 
+def test_prdp_train_goes_on_where_nobody_takes_its_lines(tmp_path):
+    read, write = os.pipe()
+    os.close(read)
+    command = [TRAINER, ROOT / "examples/scenes/heat_1d.toml", "--intervals", "20", "--out", tmp_path]
+    assert subprocess.run(command, stdout=write, check=False).returncode == 0
+    os.close(write)
+    assert (tmp_path / "auto/seed_0.json").exists()
+
+
 @pytest.mark.parametrize("words", ["scenes", "--version", "train --help"])
 def test_a_closed_or_full_standard_output_is_no_error(words):
     for output in ("&-", "/dev/full"):

@@ -91,6 +91,10 @@ def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, m
 def test_missing_keys_of_a_table_are_named_at_once(tmp_path):
     scene = written(tmp_path, ("nu = 1e-3", ""), ("shape = [30]", ""), ("dt = 1.0", "dt = -1.0"))
     assert_refused(scene, "[physics]", "physics.shape, physics.nu: missing; the table holds: dt, equation")
+    scene = written(tmp_path, ("train = 200", ""), ("valid_steps = 2", ""), name="optional")
+    assert_refused(scene, "[data]", "data.train, data.valid_steps: missing; the table holds: modes, seed, valid")
+    scene = written(tmp_path, ("width = 32", ""), ("levels = 3", "levels = 100"), scene="kolmogorov_unet", name="unet")
+    assert_refused(scene, "[network]", "network.width: missing; the table holds: kind, levels, zero_output")
 
 
 def test_bicgstab_is_a_method_of_scenes_without_a_restart(tmp_path):

@@ -30,16 +30,21 @@ Rows solved_samples(const Solved& solved) {
 }
 
 std::vector<double> allowed_disagreement(const Solved& solved, const Solver& solver) {
+  const int64_t batch = solved.b.size(0);
   const bool nears_breakdowns = traits(solver.method).nears_breakdowns;
-  auto allowed = to_host<double>(solved.residual, solved.b.size(0));
-  for (double& of_sample : allowed) {
-    const double residual = of_sample;
-    // No further than zero is. Of a recurrence that may have come near a breakdown, no further than the gradient of an
-    // iterate with this residual may be from that of the solution.
-    of_sample = nears_breakdowns ? std::clamp(10.0 * std::sqrt(residual), 1e-3, 1.0) : 1.0;
+  const auto residuals = to_host<double>(solved.residual, batch);
+  const auto statuses = to_host<int64_t>(solved.status, batch);
+  std::vector<double> allowed(batch, 1.0);  // no further than zero is
+  for (int64_t i = 0; i < batch; ++i) {
+    const double r = residuals[i];
+    // A recurrence that may have come near a breakdown: no further than the gradient of an iterate with this residual
+    // may be from that of the solution.
+    if (nears_breakdowns) allowed[i] = std::clamp(10.0 * std::sqrt(r), 1e-3, 1.0);
     // Where a loose tolerance ended it, the two differ by right: in one number of a field by 30 times at 0.2, by 9 at
-    // 0.01. Rounding that the iterations amplify is off by millions.
-    of_sample = std::max(of_sample, 1e4 * residual);
+    // 0.01. Rounding that the iterations amplify is off by millions; near a breakdown it may be off by as little.
+    const bool is_loose =
+        statuses[i] == static_cast<int64_t>(SolveStatus::kConverged) && (!nears_breakdowns || r > 0.01);
+    if (is_loose) allowed[i] = std::max(allowed[i], 1e4 * r);
   }
   return allowed;
 }

@@ -8,7 +8,10 @@ void set_budget(StepperBase& stepper, const Budget& budget) {
   stepper.set_max_iter(budget.max_iter);
   auto& options = stepper.options();
   if (budget.adjoint_max_iter) options.adjoint_max_iter = *budget.adjoint_max_iter;
-  if (budget.rtol) options.solver.rtol = *budget.rtol;
+  if (budget.rtol) {
+    options.solver.rtol = *budget.rtol;
+    stepper.follow_controller();
+  }
   if (budget.adjoint_rtol) options.adjoint_rtol = budget.adjoint_rtol;
 }
 

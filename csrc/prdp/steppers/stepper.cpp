@@ -41,7 +41,7 @@ void StepperBase::check_state(const at::Tensor& u) const {
 }
 
 void StepperBase::keep(SolveInfo info) {
-  warn_of_idle_steps(info, options_.solver.rtol, options_.on_failure);
+  warn_of_idle_steps(info, options_.solver.rtol, has_controller_, options_.on_failure);
   info_ = std::move(info);
 }
 

@@ -29,6 +29,8 @@ class StepperBase {
   void set_max_iter(int64_t k);
   SolveOptions& options() { return options_; }
   const SolveOptions& options() const { return options_; }
+  /// Its tolerance is that of a controller from now on, which tells of solves that take no iteration.
+  void follow_controller() { has_controller_ = true; }
 
   /// The report of the last step or rollout; nothing before the first.
   const std::optional<SolveInfo>& info() const { return info_; }
@@ -55,6 +57,7 @@ class StepperBase {
   std::string who_;
   SolveOptions options_;
   std::optional<SolveInfo> info_;
+  bool has_controller_ = false;
   AdjointLog log_;
   std::vector<AdjointLog> logs_of_steps_;  // of the last rollout, where each step has its own
 

@@ -171,9 +171,10 @@ void read_network(Section& s, Scene& scene) {
   s.check(std::all_of(n.hidden.begin(), n.hidden.end(), [](int64_t width) { return width <= kWidest; }), "hidden",
           "expected layers of at most 1000000 units");
   s.check(n.levels <= kMostLevels, "levels", "expected at most 10 levels");
-  s.check(n.width <= kWidest >> n.levels, "width", "expected at most 1000000 channels in a block");
+  const int64_t levels = std::min(n.levels, kMostLevels);
+  s.check(n.width <= kWidest >> levels, "width", "expected at most 1000000 channels in a block");
   const auto& shape = scene.physics.shape;
-  s.check(std::all_of(shape.begin(), shape.end(), [&](int64_t extent) { return extent % (1 << n.levels) == 0; }),
+  s.check(std::all_of(shape.begin(), shape.end(), [&](int64_t extent) { return extent % (1 << levels) == 0; }),
           "levels", "expected 2^levels to divide each N of physics.shape");
   s.check(n.blocks <= kMostBlocks, "blocks", "expected at most 10000 blocks");
   s.flag(n.zero_output, {.name = "zero_output", .means = "whether the last layer starts at zero", .optional = true});

@@ -65,7 +65,7 @@ class TomlSection {
   /// Reads an inner table by read(its section, scene).
   template <class Read>
   void section(Scene& scene, Read read, const Key& key) {
-    if (!given(key)) return refuse_missing();
+    if (!given(key)) return refuse_now(key);
     const auto* inner = table_[key.name].as_table();
     if (!inner) fail(key.name, "expected a table");
     TomlSection section(*inner, file_, full(key.name));
@@ -87,7 +87,7 @@ class TomlSection {
   }
   template <class T, class FromName>
   void choice(T& target, FromName from_name, const Choices& choices, const Key& key) {
-    if (!given(key)) return refuse_missing();  // which keys come next may depend on it
+    if (!given(key)) return refuse_now(key);
     const auto chosen = value<std::string>(key.name, "a string");
     std::ostringstream allowed;
     for (const auto& [name, when] : choices) {
@@ -202,6 +202,10 @@ class TomlSection {
     for (const auto& [key, node] : table_) present << (present.tellp() > 0 ? ", " : "") << key.str();
     TORCH_CHECK_VALUE(false, file_, ":", table_.source().begin.line, ": ", c10::Join(", ", missing_),
                       ": missing; the table holds: ", table_.empty() ? "nothing" : present.str());
+  }
+  /// Of a key that others depend on: which come next, and what they may be.
+  void refuse_now(const Key& key) const {
+    if (key.when.holds && !key.optional) refuse_missing();
   }
   /// Whether there is a value to read. If the key applies, is not optional and is missing, refuse_missing() raises.
   template <class T = void>

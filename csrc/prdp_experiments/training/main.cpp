@@ -256,7 +256,12 @@ int main(int argc, char** argv) {
   } catch (const CLI::ParseError& error) {
     return app.exit(error) == 0 ? 0 : 2;
   }
-  for (const int signal : {SIGINT, SIGTERM}) std::signal(signal, [](int got) { interrupted = got; });
+  const auto on_signal = [](int signal) {
+    interrupted = signal;
+    std::signal(signal, SIG_DFL);  // a second one ends it at once
+  };
+  for (const int signal : {SIGINT, SIGTERM}) std::signal(signal, on_signal);
+  std::signal(SIGPIPE, SIG_IGN);  // the training goes on where nobody takes its lines
   prdp::interruption::set_check(stop_if_interrupted);
   std::setvbuf(stdout, nullptr, _IOLBF, BUFSIZ);  // a log can be followed
   std::string command;
