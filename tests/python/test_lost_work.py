@@ -75,6 +75,10 @@ def test_an_unfinished_training_of_other_settings_is_refused_in_words(
     path, left = unfinished(written(tmp_path, *SHORT), tmp_path)
     status, said = prdp("train", written(tmp_path, *SHORT, *changes), *more, *options, "--out", tmp_path)
     assert status == 2 and path.read_bytes() == left
+    path.with_suffix(".json").touch()  # as that of an earlier training which was copied
+    assert prdp("train", written(tmp_path, *SHORT, *changes), *more, *options, "--out", tmp_path)[0] == 2
+    assert path.read_bytes() == left
+    path.with_suffix(".json").unlink()
     assert f"checkpoint: '{path}' is of a training that has not ended, with other settings: {differs}; " in said
     status, said = prdp("train", written(tmp_path, *SHORT), "--resume", "--out", tmp_path)
     assert (status, said) == (0, "") and not path.exists()

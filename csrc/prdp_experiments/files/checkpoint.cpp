@@ -56,12 +56,15 @@ std::vector<Checkpoint::Found> Checkpoint::find() {
   return found;
 }
 
+bool Checkpoint::is_of_another(const fs::path& path) const {
+  const auto opened = open_sealed(path, kKind);
+  return opened && opened->sealed && opened->sealed->settings != settings_;
+}
+
 void Checkpoint::refuse_other(const fs::path& record) const {
   remove_before(record);
   for (const auto& path : {path_, before_}) {
-    const auto opened = open_sealed(path, kKind);
-    TORCH_CHECK_VALUE(!opened || !opened->sealed || opened->sealed->settings == settings_, "checkpoint: '",
-                      path.string(),
+    TORCH_CHECK_VALUE(!is_of_another(path), "checkpoint: '", path.string(),
                       "' is of a training that has not ended, with other settings or of another version; give its "
                       "settings and --resume to go on with it, or another --out, or delete the file");
   }
@@ -127,7 +130,7 @@ void Checkpoint::remove() const {
 void Checkpoint::remove_before(const fs::path& record) const {
   std::error_code error, none;
   const auto finished = fs::last_write_time(record, error), kept = fs::last_write_time(path_, none);
-  if (!error && !none && kept <= finished) remove();
+  if (!error && !none && kept <= finished && !is_of_another(path_)) remove();
 }
 
 }  // namespace prdp

@@ -45,7 +45,8 @@ class Checkpoint {
   void check_length(int64_t done, int64_t intervals) const;
   /// Removes both files, where they are there. Raises ValueError where one cannot be removed.
   void remove() const;
-  /// Removes them if they are older than the record of their training: a kill came between the two.
+  /// Removes them if they are older than the record of their training: a kill came between the two. Those of another
+  /// training stay, as a record that was copied or touched is newer, too.
   void remove_before(const std::filesystem::path& record) const;
   /// Raises ValueError for a state of other settings, or of another version, that is not older than the record: it
   /// would be overwritten.
@@ -58,6 +59,7 @@ class Checkpoint {
   using Clock = std::chrono::steady_clock;
 
   void find_in(const std::filesystem::path& path, std::vector<Found>& found);
+  bool is_of_another(const std::filesystem::path& path) const;
 
   std::filesystem::path path_, before_;
   std::string settings_;
