@@ -70,7 +70,10 @@ class CppForgery(Forgery):
     def outcome(self, done):
         """Refused or taken; a training may have diverged."""
         if done.returncode == 2:
-            return checked_message(done.stderr.removesuffix("\n"), self.folder)
+            lines = done.stderr.splitlines()
+            if lines and lines[0].startswith("prdp_train: replaces when it ends: "):  # an earlier record
+                lines.pop(0)
+            return checked_message("\n".join(lines), self.folder)
         if done.returncode not in (0, 1):
             raise Fault(f"exit status {done.returncode}: {done.stderr}")
         return TAKEN

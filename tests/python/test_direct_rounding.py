@@ -188,3 +188,4 @@ def test_a_large_residual_of_a_direct_solve_is_told(always):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         prdp.linear_solve(a, 1e-10 * u, prdp.Direct(rtol=0.0))  # nothing was asked for
+        prdp.linear_solve(a, 1e-10 * u, prdp.Direct(0))

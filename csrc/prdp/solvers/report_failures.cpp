@@ -138,8 +138,10 @@ bool later_iterations_were_worse(const Report& report, int64_t sample) {
 bool warn_of_growth(const Report& report) {
   const bool is_direct = traits(report.role.solver.method).is_direct;
   const double bound = is_direct ? report.large_residual() : 1.0;
-  const auto grown = report.samples_where(
-      [&](int64_t i) { return report.status(i) == SolveStatus::kMaxIter && report.residuals[i] > bound; });
+  const auto grown = report.samples_where([&](int64_t i) {
+    const bool has_solved = !is_direct || report.iterations[i] > 0;  // max_iter may be 0
+    return report.status(i) == SolveStatus::kMaxIter && report.residuals[i] > bound && has_solved;
+  });
   if (grown.empty()) return false;
   const int64_t worst = report.worst_of(grown);
   const auto say = [&](std::ostream& text) {
