@@ -76,7 +76,7 @@ def test_a_march_towards_a_steady_state_says_nothing(solver, steps, always):
 
 @pytest.mark.parametrize("rtol", [1e-5, 3e-5, 1e-4, 1e-3])
 def test_a_cable_that_a_current_lifts_is_told_at_every_tolerance(rtol, always):
-    """At rest at -65: the change of a step is far below the state. At 1e-5 one step in nine works, the first among
+    """At rest at -65: the change of a step is far below the state. At 1e-5 one step in eight works, the first among
     them; at 1e-3 none does."""
     n, dt, rest = 100, 0.025, -65.0
     cable = prdp.operators.Diffusion(torch.full((1, n), 0.5, dtype=F64), 1 / dt + 0.1, boundary="flux", length=40.0)

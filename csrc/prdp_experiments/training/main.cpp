@@ -9,6 +9,7 @@
 #include <cstdio>
 #include <exception>
 #include <filesystem>
+#include <optional>
 #include <thread>
 #include <utility>
 #include <vector>
@@ -94,22 +95,28 @@ prdp::Checkpoint checkpoint_of(const fs::path& record, const Identity& identity,
   return {fs::path(record).replace_extension(".checkpoint"), text_of(all)};
 }
 
+/// How many intervals a record has, if it is of this training.
+std::optional<int64_t> intervals_if_same(const Json& record, const Identity& identity) {
+  auto found = record.at("settings");
+  const auto intervals = found.at("intervals").get<int64_t>();
+  found.erase("intervals");
+  return found == identity.settings() ? std::optional(intervals) : std::nullopt;
+}
+
 /// Whether the record is of this training, finished, and its weights are there. Throws if they are damaged, or if it is
 /// of another length and nothing is left to go on from.
 bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& checkpoint) {
   const auto kept = prdp::read_training(path);
   if (!kept) return false;
-  auto found = kept->at("settings");
-  const auto intervals = found.at("intervals").get<int64_t>();
-  found.erase("intervals");
+  const auto intervals = intervals_if_same(*kept, identity);
   const auto wanted = identity.scene.training.intervals;
-  if (found != identity.settings()) return false;
-  if (intervals == wanted) {
+  if (!intervals) return false;
+  if (*intervals == wanted) {
     if (kept->contains("weights") && !prdp::read_weights(path, kept->at("weights").get<std::string>())) return false;
     checkpoint.remove_before(path);
     return true;
   }
-  if (checkpoint.find().empty()) prdp::refuse_finished(path, intervals, wanted);
+  if (checkpoint.find().empty()) prdp::refuse_finished(path, *intervals, wanted);
   return false;
 }
 
@@ -118,12 +125,10 @@ std::string replaced_by(const Identity& identity, const fs::path& path, bool res
   try {
     const auto kept = prdp::read_training(path);
     if (!kept) return {};
-    auto found = kept->at("settings");
-    const bool as_long = found.at("intervals").get<int64_t>() == identity.scene.training.intervals;
-    found.erase("intervals");
-    const bool same = found == identity.settings();
-    if (same && resume) return {};
-    return "'" + path.string() + (same && as_long ? "', of the same settings" : "', of other settings");
+    const auto intervals = intervals_if_same(*kept, identity);
+    if (intervals && resume) return {};
+    const bool same = intervals == identity.scene.training.intervals;
+    return "'" + path.string() + (same ? "', of the same settings" : "', of other settings");
   } catch (const c10::Error&) {  // with --resume, who reads it says so
     return resume ? "" : "'" + path.string() + "', which is damaged";
   }
