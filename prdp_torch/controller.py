@@ -23,7 +23,7 @@ Row: TypeAlias = tuple[float, float, int, bool, float | None, float | None]
 """What the compiled controllers keep of a call of `step`, as a `Record` has it."""
 
 PATIENCE, LONG_PATIENCE = 5, 30
-"""A `warning` that lasts so many intervals without a refinement is said aloud; so many with refinements, too."""
+"""A `warning` is said aloud after so many intervals without a refinement, or so many intervals in all."""
 
 
 class _Attached(_Compiled):

@@ -56,7 +56,8 @@ class AdjointLog:
 
 
 class LogOfStep(AdjointLog):
-    """That of a step of a rollout within the one log of all, which is the only one that a compiled graph can hold."""
+    """The log of one step in a compiled rollout. The graph holds a single log, which owns the numbers that follow its
+    own, one for each step (adjoint_log.h)."""
 
     def __init__(self, log: AdjointLog, step: int) -> None:
         self.number = log.number_in_graph() + 1 + step

@@ -42,7 +42,7 @@ def _make(call: _Call, u: Tensor) -> Tensor:
 
 
 def _take_over(context: contextvars.Context) -> None:
-    """What the call has set for itself stays, as after any other call."""
+    """Copy what the call has set, in a copy of the context, into ours: it stays set, as after any other call."""
     for variable, value in context.items():
         if variable is not _call and variable.get(None) is not value:
             variable.set(value)
@@ -147,7 +147,7 @@ class Stepper(HasSettings):
                 raise ValueError(f"rollout: steps must be >= 0, got {steps}")
         u = full_precision(u)
         logs = LogOfRollout(self._adjoint_log, steps) if compiling else AdjointLogs(steps)
-        step_from = self._called if self._calls_do_more_than(Stepper.forward) else self._solve
+        step_from = self._step_by_calling_module if self._calls_do_more_than(Stepper.forward) else self._solve
         states, reports = [u], []
         for step in range(steps):
             if isinstance(logs, LogOfRollout):
@@ -174,7 +174,7 @@ class Stepper(HasSettings):
         is_replaced = type(self).forward is not forward or "forward" in vars(self)
         return is_replaced or torch_private.calls_have_hooks(self)
 
-    def _called(self, u: Tensor, log: AdjointLog) -> tuple[Tensor, ...]:
+    def _step_by_calling_module(self, u: Tensor, log: AdjointLog) -> tuple[Tensor, ...]:
         """What a call of the module makes of u, and the report of its last step: none if it makes none."""
         if self._is_rolling_out or self._call_of_rollout() is not None:
             raise RuntimeError(
@@ -213,7 +213,7 @@ class Stepper(HasSettings):
         """Keep the report of what made u. Without gradients, as in a validation, that of the last backward pass
         stays."""
         compiling = torch.compiler.is_compiling()
-        # A compiled graph would be made again once it finds another kind of log.
+        # A compiled graph is made for one type of _last_log, so that all compiled calls set it, and none recompiles.
         if u.requires_grad and (compiling or self._last_log is not log):
             self._last_log = log
         kept = None if report is None else outlive_transforms(report)
@@ -238,16 +238,19 @@ class Stepper(HasSettings):
         if not compiling and _check.dense(who, "u", u).dim() < 2:
             raise ValueError(f"{who}: u must have shape (batch, ...), got {tuple(u.shape)}")
         u = full_precision(u)
-        in_graph = (compiling and u.requires_grad) or (not compiling and torch_private.transforms_are_active())
-        if self.on_failure != "raise" and in_graph:
+        # No gradient reaches u through a refused sample; with on_failure="raise" there is none.
+        if self.on_failure == "raise" or (compiling and not u.requires_grad):
+            return self._solve_from(u, log)
+        if compiling or torch_private.transforms_are_active():  # a graph takes no hook
             return self._solve_from(self._constant_where_refused(u), log)
-        may_lose = self.on_failure != "raise" and not compiling and u.requires_grad
-        if not may_lose or u.is_cpu:
+        if not u.requires_grad:
+            return self._solve_from(u, log)
+        if u.is_cpu:  # looking is free, and u needs no hook unless a sample was refused
             found = self._solve_from(u, log)
-            if not may_lose or not _C.any_nonfinite(_status_of(found)):
+            if not _C.any_nonfinite(_status_of(found)):
                 return found
         # The hook sits on a view, to see the cotangent of this step alone. Gradients through a view are summed in
-        # another order. On the CPU, where looking is free, u becomes one only once a sample was refused.
+        # another order.
         state = u.view_as(u)
         found = self._solve_from(state, log)
         _C.block_gradients_of_failed(state, _status_of(found), self.on_failure)

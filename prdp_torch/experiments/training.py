@@ -237,13 +237,13 @@ class _Run:
         while not stopped and self._done() < self.intervals:
             self._run_interval(task, self._done() + 1)
             self._observe(task, self._done())
-            unfinished = self.checkpoint if self._done() < self.intervals else None
-            kept = unfinished is not None and unfinished.due()
-            if unfinished is not None and kept:
-                self._save(task, unfinished)
+            checkpoint = self.checkpoint if self._done() < self.intervals else None  # a whole training needs none
+            was_due = checkpoint is not None and checkpoint.due()
+            if checkpoint is not None and was_due:
+                self._save(task, checkpoint)
             stopped = self._notify(self._done())
-            if stopped and unfinished is not None and not kept:
-                self._save(task, unfinished)
+            if checkpoint is not None and stopped and not was_due:
+                self._save(task, checkpoint)
         if self.controller.warning is not None:
             self.curves["warning"] = self.controller.warning
 

@@ -37,11 +37,12 @@ std::vector<double> allowed_disagreement(const Solved& solved, const Solver& sol
   std::vector<double> allowed(batch, 1.0);  // no further than zero is
   for (int64_t i = 0; i < batch; ++i) {
     const double r = residuals[i];
-    // A recurrence that may have come near a breakdown: no further than the gradient of an iterate with this residual
-    // may be from that of the solution.
+    // Near a breakdown the recurrence amplifies rounding. Allowed is what the gradient of an iterate with residual r
+    // may be off by, 10 √r, but 1e-3 at least and 1 at most.
     if (nears_breakdowns) allowed[i] = std::clamp(10.0 * std::sqrt(r), 1e-3, 1.0);
-    // Where a loose tolerance ended it, the two differ by right: in one number of a field by 30 times at 0.2, by 9 at
-    // 0.01. Rounding that the iterations amplify is off by millions; near a breakdown it may be off by as little.
+    // A loose tolerance lets the two differ by right: in one number of a field by 30 times at r = 0.2, by 9 at 0.01.
+    // 1e4 r leaves room for that, and still finds rounding that iterations amplified, which is off by millions. Near a
+    // breakdown rounding may be off by little more, so that there only r > 0.01 counts as loose.
     const bool is_loose =
         statuses[i] == static_cast<int64_t>(SolveStatus::kConverged) && (!nears_breakdowns || r > 0.01);
     if (is_loose) allowed[i] = std::max(allowed[i], 1e4 * r);
@@ -79,6 +80,8 @@ Rows misleading_a_bar(const OperatorSpec& spec, const std::vector<at::Tensor>& g
       const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch);
       for (int64_t i = 0; i < batch; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
     };
+    // By the numbers of each sample; by the whole tensor where samples share it; by both of a Function, which may do
+    // so.
     if (of_samples) mark_by([&](const at::Tensor& t) { return t.reshape({batch, -1}).norm(2, 1); });
     if (!of_samples || is_function(spec)) mark_by([](const at::Tensor& t) { return t.norm(); });
   }

@@ -39,7 +39,8 @@ namespace {
 SolveOptions options_of_adjoint(SolveOptions o) {
   o.solver.max_iter = o.adjoint_max_iter.value_or(o.solver.max_iter);
   o.solver.rtol = o.adjoint_rtol.value_or(o.solver.rtol);
-  // Without a tolerance of its own, the adjoint solve keeps the traced one of the solve.
+  // In a compiled graph rtol is a symbol, traced_rtol, which counts before the number. A tolerance of the adjoint's
+  // own, number or symbol, replaces both; without one the solve's stays.
   if (o.adjoint_rtol || o.traced_adjoint_rtol.is_symbolic()) o.traced_rtol = o.traced_adjoint_rtol;
   o.solver.preconditioner = o.solver.preconditioner.transposed();
   return o;
@@ -98,7 +99,8 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   auto transpose = a;
   transpose.transposed = !a.transposed;
   const auto o = options_of_adjoint(options);
-  // The solve takes the part of a cotangent that Aᵀ reaches; after an adjoint solve, the part that A reaches is taken.
+  // Of a singular A, linear_solve_unrecorded() takes the reachable part of a cotangent where it solves with Aᵀ. The
+  // derivative of an adjoint solve solves with A: the part is taken here.
   const bool is_second = a.transposed && is_singular(a);
   const auto rhs = is_second ? reachable_part(*make_operator(transpose), cotangent) : cotangent;
   auto [lambda, info] = adjoint_solve(transpose, rhs, o, /*x0=*/{});
@@ -115,7 +117,10 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
     return products;
   };
   std::vector<at::Tensor> products;
-  // An overflow of ḡ must stay with its sample.
+  // ḡ sums over samples, and an overflow must stay with its own. How samples that overflow are left out:
+  //   on a GPU that nobody waits for   by a bound from the largest numbers of λ and u, on the device
+  //   of tensors without numbers       not at all; only refused samples are replaced
+  //   else                             sum, look, and sum again without them
   const bool has_numbers = !at::isTensorSubclassLike(lambda) && !at::isTensorSubclassLike(u);  // to look at
   if (has_numbers && !waits_for_report(o) && gpu::may_run_kernel(cotangent, o.solver) && !in_torch_func()) {
     auto kept_u = u;
@@ -143,7 +148,7 @@ SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpe
   // torch.func need it.
   bool recorded = at::GradMode::is_enabled() && !in_torch_func() && !has_tangent(cotangent) && !has_tangent(solved.b) &&
                   !any_tangent(a.tensors);
-  // An input that no longer requires a gradient did so in a transform that has ended: nothing to record.
+  // `needed` is of the forward pass. An input that has ceased to require a gradient belonged to a transform that ended.
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) recorded = recorded && (i == 0 ? solved.b : a.tensors[i - 1]).requires_grad();
   const auto vjp = recorded ? unrolled_vjp_recorded : unrolled_vjp;

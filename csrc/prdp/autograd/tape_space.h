@@ -139,7 +139,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     const auto first = number(Kind::kDot, dots[0], of, out.version);
     return {first, number(Kind::kSquare, dots[1], out.version)};
   }
-  void keep_in_range(Vector& v) { values_.keep_in_range(value(v)); }  // of whose derivative rounding is no part
+  void keep_in_range(Vector& v) { values_.keep_in_range(value(v)); }  // takes rounding off: not recorded
 
   // ---- numbers
 
@@ -205,7 +205,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   Scalar radius2() const { return values_.radius2(); }
   bool sweeps_are_log_convex() const { return values_.sweeps_are_log_convex(); }
 
-  // ---- GMRES
+  // ---- GMRES; MINRES has no tape
 
   void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) {
     plain_.resize(count);
@@ -259,7 +259,8 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     v.version = recording_ ? tape_.add_version() : v.home;
     return value(v);
   }
-  /// The same with what v holds, for an operation that changes that.
+  /// The same for an operation in place: the new value begins as the old one. While recording, the old version stays
+  /// for the way back and is copied; where the way back does not read it, the new version takes over its memory.
   T* changed(Vector& v) {
     T* const before = value(v);
     if (recording_ && !tape_.is_read(v.version)) {

@@ -66,7 +66,8 @@ class SampleVjps {
   OfIterations of_iterations_;
   decltype(linear_solve)& any_solve_;
 
-  // Made of the above and of each other, in this order.
+  // Initialised in this order, each from those above. Later only derivatives_ (by classify() and retry_implicitly()),
+  // found_ and u_ change.
   const int64_t batch_ = solved_.b.size(0);
   const std::unique_ptr<Operator> a_ = make_operator(spec_);
   // Of the forward solve.
@@ -116,8 +117,9 @@ class SampleVjps {
                                                        : Derivative::kOfIterations);
   }
 
-  /// Sums the gradients of these samples, without those that are not finite. finite_sum() looks for them among fewer
-  /// and fewer samples; its last call is for those that stay, and what that leaves in `found` is theirs.
+  /// The sum of these samples' gradients, without those that are not finite. To find them, finite_sum() calls the
+  /// lambda for fewer and fewer samples, last for those that stay; each call overwrites the outcomes and of_samples of
+  /// `found`, so that those of the last call remain.
   Differentiated differentiate(Rows rows) {
     Differentiated found;
     found.outcomes.resize(batch_);
@@ -189,8 +191,8 @@ class SampleVjps {
     auto misleading = misleading_b_bar(*a_, finite_cotangent_, found_.gradients[0], rows, allowed);
     rows = except(rows, misleading);
     if (needs_gradient_of_a_ && any(rows)) {
-      misleading =
-          either(misleading, can_be_alone() ? misleading_alone(rows, allowed) : misleading_together(rows, allowed));
+      misleading = either(
+          misleading, knows_shares_of_samples() ? misleading_alone(rows, allowed) : misleading_together(rows, allowed));
     }
     if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)
@@ -198,8 +200,8 @@ class SampleVjps {
     found_ = differentiate(found_.finite);
   }
 
-  /// Whether samples share a tensor of A, so that its gradient is a sum over them, of which their shares are known.
-  bool can_be_alone() const {
+  /// Whether samples share a needed tensor of A, so that its gradient is a sum, and the share of each is known.
+  bool knows_shares_of_samples() const {
     if (batch_ == 1 || found_.of_samples.empty()) return false;
     for (size_t k = 0; k < spec_.tensors.size(); ++k)
       if (needed_[k + 1] && !is_of_samples(spec_, k, batch_)) return true;
@@ -227,12 +229,12 @@ class SampleVjps {
     if (!found[0].defined()) return Rows(batch_);
     return misleading_a_bar(spec_, found, solution().detach(), needed_, rows, allowed);
   }
-  /// Those of the iterations of these samples alone; undefined where none ran.
+  /// The gradients of the iterations of these samples alone; undefined where none ran.
   std::vector<at::Tensor> gradients_of(const Rows& rows) const {
+    bool others_contribute = false;
     for (int64_t i = 0; i < batch_; ++i)
-      if (!rows[i] && found_.finite[i] && derivatives_[i] != Derivative::kNone)
-        return vjp_of_iterations(rows).gradients;
-    return found_.gradients;  // no other sample contributes
+      others_contribute = others_contribute || (!rows[i] && found_.finite[i] && derivatives_[i] != Derivative::kNone);
+    return others_contribute ? vjp_of_iterations(rows).gradients : found_.gradients;
   }
 
   void leave_out_failed_adjoints() {

@@ -17,8 +17,8 @@ namespace {
 /// z, y and x.
 using Point = std::array<int64_t, 3>;
 
-/// Coarse points that one call of the loops takes: a whole row. But where the axis is x, the inner points, which all
-/// have both neighbours, or one end alone, which may lack one.
+/// Coarse points of one row that a call of the loops makes. Where z or y is coarsened, the whole row, whose points all
+/// have the same neighbours. Where x is: its first point, those between, or its last, as only the ends may lack one.
 struct CoarseRun {
   GridRow row;  // of the coarse grid
   int64_t first, count;
@@ -73,7 +73,8 @@ class CoarseCoefficients {
     const auto weight_of_row = [&](const Field<T>& weights, const Point& p) {
       return weights.data() + ringed_.at(p[0], p[1], p[2]);
     };
-    // Interpolation weights are those of the column: at the offset of the coefficient in the other axes.
+    // A coefficient couples a row of A, this point, to a column, the point at its offset in the other axes. Restriction
+    // is that of the row, interpolation that of the column.
     const auto weight_of_column = [&](const Field<T>& weights, const Point& p) {
       const auto& o = offset_.along;
       return weights.data() + ringed_.at(p[0] + o[0], p[1] + o[1], p[2] + o[2]);
@@ -117,7 +118,7 @@ class CoarseCoefficients {
     // by zeros with an even number: the last point is coarse.
     return {fine(here - 1), fine(here), fine(here + 1), here > 0 || (periodic && extent % 2 == 0), here + 1 < extent};
   }
-  /// Of a coefficient in a stencil.
+  /// Of the coefficient with offset d - 1 along the axis, and those of `centre` in the others.
   int place(int centre, int d) const { return centre + (d - 1) * (axis_ == 0 ? 9 : axis_ == 1 ? 3 : 1); }
 
   const StencilFields<T>& a_;
@@ -182,7 +183,7 @@ StencilFields<T> galerkin_product(const StencilFields<T>& a, int axis, const Axi
     if (part.is_empty()) continue;
     part.add_to(coarse, centre);
     for_each_row(coarse.grid, [&](const GridRow& row) {
-      if (axis != 2) return part.make({row, 0, a.grid.shape[2]});
+      if (axis != 2) return part.make({row, 0, a.grid.shape[2]});  // as long as the fine row
       part.make({row, 0, 1});
       if (count > 2) part.make({row, 1, count - 2});
       if (count > 1) part.make({row, count - 1, 1});

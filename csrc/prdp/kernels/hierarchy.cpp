@@ -84,6 +84,7 @@ bool all_finite(const StencilFields<T>& a) {
 
 using Eigen::MatrixXd;
 
+/// Of at most 64 rows: a bit for each entry of one.
 int count_parts(const MatrixXd& m) {
   const int n = static_cast<int>(m.rows());
   std::vector<uint64_t> of_row(n), of_column(n);
@@ -101,17 +102,15 @@ struct PseudoInverse {
   MatrixXd matrix;
   bool is_whole;  // nothing was left out but the null space
 
-  /// For a null space of `nullity` dimensions: rounding of the coefficients may have made the matrix regular, and its
-  /// inverse would be rounding all the same. Parts that nothing couples have a null vector each, which may be gone on
-  /// so coarse a grid.
+  /// `nullity`: how many null vectors A is said to have. As many of the least singular values are left out, even where
+  /// rounding has made them larger than `tiny`: their inverse would be rounding. But a part of the grid that nothing
+  /// couples to the rest may be gone on so coarse a grid, and its null vector with it: then only those below 1e-3 are.
   PseudoInverse(const MatrixXd& m, int64_t nullity, double tiny) {
     const Eigen::JacobiSVD<MatrixXd> svd(m, Eigen::ComputeFullU | Eigen::ComputeFullV);
     const auto& singular = svd.singularValues();
     const bool all_are_there = count_parts(m) >= nullity;
     Eigen::VectorXd inverse = Eigen::VectorXd::Zero(m.rows());
     is_whole = true;
-    // Where all null vectors are there, the last `nullity` are left out, whatever their size; else those that look
-    // null.
     for (int64_t i = 0; i < m.rows(); ++i) {
       const double size = singular[i] / singular[0];
       if (i >= m.rows() - nullity && (all_are_there || size < 1e-3)) continue;
@@ -148,6 +147,9 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(StencilFields<T> finest, 
   std::unique_ptr<Hierarchy> h(new Hierarchy);
   h->symmetric_ = is_symmetric(finest);
   StencilFields<T> a = std::move(finest);
+  const auto keep_fields = [&] {  // of all grids but the finest, like packed_
+    if (h->levels_.size() > 1 && !h->symmetric_) h->fields_.push_back(std::move(a));
+  };
   for (;;) {
     const double radius = gershgorin_bound(a);
     if (!std::isfinite(radius) || !all_finite(a)) return nullptr;
@@ -162,11 +164,11 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(StencilFields<T> finest, 
       coarse = galerkin_product(fine, axis, weights);
     }
     if (axes.empty()) break;
-    if (h->levels_.size() > 1 && !h->symmetric_) h->fields_.push_back(std::move(a));
+    keep_fields();
     a = std::move(coarse);
   }
   if (!h->invert_coarsest(a, nullity)) return nullptr;
-  if (h->levels_.size() > 1 && !h->symmetric_) h->fields_.push_back(std::move(a));
+  keep_fields();
   h->transposed_.resize(h->packed_.size());
   return h;
 }

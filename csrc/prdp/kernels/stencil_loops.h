@@ -43,12 +43,12 @@ struct Line {
   Register<T> right() const { return lanes_from<T, 1>(here, after); }
 };
 
-/// Row j of plane z of a field with what lies around it; its coefficients in A, whose products may be made of
-/// differences.
+/// Row j of plane z of a field, the rows around it, and its coefficients (NeighbourStencil in loops.h says how they
+/// lie). With Differences, a neighbour counts by its difference from the point, and the point itself by its row sum.
 template <int Dim, class T, bool Differences = false>
 struct NeighbourRow {
   const NeighbourStencil<T>& a;
-  int64_t row, last;  // its padded length; where its last register starts
+  int64_t row, last_register;  // its padded length; where its last register starts
   // own: what the point itself is multiplied by; ends: what couples the two ends of a periodic row, null where none do
   const T *w, *own, *ends, *below, *above, *back, *front;
   Line<T> line;
@@ -56,7 +56,7 @@ struct NeighbourRow {
   NeighbourRow(const NeighbourStencil<T>& stencil, int64_t z, int64_t j, const T* field)
       : a(stencil),
         row(a.row),
-        last((a.nx - 1) / kWidth<T> * kWidth<T>),
+        last_register((a.nx - 1) / kWidth<T> * kWidth<T>),
         w(a.coefficients + (z * a.ny + j) * (2 * Dim + 1) * row),
         own(Differences ? a.row_sums + (z * a.ny + j) * a.row_sum_step : w),
         ends(a.ends ? a.ends + (z * a.ny + j) * 2 * kLanes<T> : nullptr),
@@ -82,10 +82,12 @@ struct NeighbourRow {
     }
     return sum;
   }
+  /// Adds what couples the ends of a periodic row: at its first register the last point, at its last register the
+  /// first. `ends` has kLanes numbers for either.
   Register<T> with_ends(int64_t i, Register<T> sum) const {
     if (!ends) return sum;
     if (i == 0) sum += load(ends) * from_here(line.v[a.nx - 1]);
-    if (i == last) sum += load(ends + kLanes<T> + last % kLanes<T>) * from_here(line.v[0]);
+    if (i == last_register) sum += load(ends + kLanes<T> + last_register % kLanes<T>) * from_here(line.v[0]);
     return sum;
   }
   /// Of a neighbour, a register or one value, what its coefficient multiplies.

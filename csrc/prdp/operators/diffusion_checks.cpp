@@ -157,6 +157,7 @@ std::optional<DiffusionOperator::Refused> DiffusionOperator::first_refused(int64
     auto numbers = t.select(0, t.size(0) == 1 ? 0 : sample);
     if (!(is_kappa && per_axis_)) numbers = numbers.select(0, 0);
     auto wrong = nonfinite(numbers);
+    // A shift is refused only where it is not finite, of which refusal() says more: its words below are never read.
     if (!is_shift) wrong = wrong.logical_or(is_kappa ? numbers.le(0) : numbers.lt(0));
     if (!wrong.any().item<bool>()) continue;
     return Refused{is_kappa ? "kappa must be > 0" : "h of a Robin side must be >= 0",

@@ -52,7 +52,8 @@ std::optional<std::vector<int64_t>> batched_axes(const std::string& kind, int64_
   const size_t bases = is_singular(kind) ? 2 : 0;
   if (!of_tensors->empty()) of_tensors->resize(tensors - bases, of_tensors->back());
   for (auto& n : *of_tensors)
-    if (n < 0) n += axes - kLikeSide;  // a side, the lowest constant, has `axes` with the batch; each above it one more
+    // A side, the lowest constant, has `axes` of them, the batch included; each constant above it has one more.
+    if (n < 0) n += axes - kLikeSide;
   of_tensors->resize(of_tensors->size() + bases, axes + 3);  // of null spaces: as a vector, behind how many there are
   return of_tensors;
 }

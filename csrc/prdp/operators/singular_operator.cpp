@@ -48,8 +48,8 @@ at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
   return at::stack(done, -2);
 }
 
-/// The same of disjoint rows, in a few operations however many there are; nothing if one of them is zero, or not
-/// finite, and may not be.
+/// orthonormalised() of disjoint rows, in a few operations however many there are. Nothing where a number is not finite
+/// or a row is zero; of vectors that each sample has for itself, rows of zeros are allowed.
 DisjointVectors disjoint_vectors(const at::Tensor& rows) {
   const auto vector = rows.ne(0).to(at::kByte).argmax(-2), entry = rows.sum(-2);
   const auto squares = at::zeros(rows.sizes().slice(0, rows.dim() - 1), rows.options());
@@ -114,11 +114,12 @@ SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSp
       left_{spec.tensors.back().detach(), spec.tensors.back()},
       needs_derivative_(any_needs_derivative(at::TensorList(spec.tensors).slice(spec.tensors.size() - 2))),
       title_(operator_kind(spec.kind).title) {
-  // Whether they are of each sample is known beside a vector, where check_vector() looks again.
+  // With more than two axes a basis counts its vectors along axis 0, or along axis 1 where each sample has its own;
+  // only a vector tells which (check_vector()). So two such bases are refused here only if they differ along both axes.
   const auto has_axes = [](const Basis& basis) { return basis.given.dim() > 2; };
   const bool both = has_axes(right_) && has_axes(left_), any = has_axes(right_) || has_axes(left_);
-  if (both ? right_.given.sym_size(1) != left_.given.sym_size(1) : !any)
-    check_counts(right_.count(/*axis=*/0), left_.count(0));
+  const bool differ_along_1 = both && right_.given.sym_size(1) != left_.given.sym_size(1);
+  if (differ_along_1 || !any) check_counts(right_.count(/*axis=*/0), left_.count(0));
 }
 
 void SingularOperator::check_counts(const c10::SymInt& right, const c10::SymInt& left) const {
@@ -185,7 +186,9 @@ std::optional<OperatorSpec> stencil_of(const Operator& a) {
   return std::nullopt;
 }
 
-/// P_r (A + ‖A‖ Q_l Q_rᵀ)⁻¹ P_l b, where the columns of Q_l and Q_r span the null spaces of Aᵀ and A.
+/// (A + s Q_l Q_rᵀ)⁻¹ b with s = max |a_ij|, for a dense A that `product` gives column by column. The columns of Q_l
+/// and Q_r, which are the rows of q_left and q_right, span the null spaces of Aᵀ and A. Callers project b before, u
+/// after.
 template <class Product>
 at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const at::Tensor& q_left,
                          const Product& product) {

@@ -73,7 +73,7 @@ class SingularOperator final : public Operator {
     at::Tensor given;   // without a derivative
     at::Tensor source;  // what the spec has
     mutable at::Tensor orthonormal{};           // in double, once it has been asked for
-    mutable std::optional<DisjointVectors> disjoint{};  // likewise, where they are so
+    mutable std::optional<DisjointVectors> disjoint{};  // likewise; without vectors where they are not disjoint
 
     bool is_constant() const { return given.sym_numel() == 0; }
     /// Whether each sample of v has vectors of its own.

@@ -23,8 +23,8 @@ int64_t stride(const States& states, bool track) {
   return n;
 }
 
-/// At most `cap` iterations of each active sample. With `track`, every residual is looked at that may be
-/// small enough.
+/// Runs each active sample for at most `cap` iterations. `track`: residuals are judged on the way, at each planned
+/// look; without it, as for rtol = 0, nothing is judged before conclude().
 template <class Space, class Method>
 PRDP_NOINLINE void run(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   method.start();
@@ -95,13 +95,13 @@ PRDP_NOINLINE void conclude(Space& space, Method& method, typename Space::States
 /// last iterate is as good as the dtype allows.
 template <class Space, class Method>
 void accept_at_rounding_floor(Space& space, const Method& method, typename Space::States& states) {
-  const auto is_above = [](const SampleState& s) { return s.returned != Returned::kLast; };
-  if (std::none_of(states.begin(), states.end(), is_above)) return;
+  const auto is_doubted = [](const SampleState& s) { return s.returned != Returned::kLast; };
+  if (std::none_of(states.begin(), states.end(), is_doubted)) return;
   const auto definite = space.surely_definite();
   const auto floors = rounding_floors(space, method);
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    if (is_above(s) && definite[i] && s.residual2 <= 64.0 * floors[i] * floors[i]) s.returned = Returned::kLast;
+    if (is_doubted(s) && definite[i] && s.residual2 <= 64.0 * floors[i] * floors[i]) s.returned = Returned::kLast;
   }
 }
 
@@ -127,7 +127,7 @@ void accept_if_insensitive(Space& space, const Method& method, typename Space::S
 /// A may move u, A is singular to the dtype, and zero replaces u. Any other residual above ‖b‖ is a breakdown.
 template <class Space, class Method>
 void judge_numerical_singularity(Space& space, const Method& method, typename Space::States& states, bool track) {
-  const auto is_large = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
+  const auto is_large = [](const SampleState& s) { return is_unsolved(s.status) && is_far_from_solved(s); };
   const auto is_doubtful = [&](const SampleState& s) {
     return is_large(s) || (track && s.status == SolveStatus::kMaxIter);
   };
@@ -152,21 +152,21 @@ void judge_numerical_singularity(Space& space, const Method& method, typename Sp
 template <class Method>
 inline constexpr bool kMayGrow = kMayExhaust<Method> || (kHasRecursiveResidual<Method> && !kDescendsEnergy<Method>);
 
-/// Which samples are far from solved, and have a u so large that A u rounds by much beside b: it has grown. The
-/// rounding is ε ‖|A| |u|‖, estimated with random signs, as ε ‖A‖ ‖u‖ is large beside a penalty, too. In float32 any u
-/// near a null space is so large, and may be the best that there is.
+/// Which samples have a u that has grown: they are far from solved, and the rounding of A u, ε ‖|A| |u|‖, is large
+/// beside b. It is estimated with random signs, as ε ‖A‖ ‖u‖ is large wherever A has a penalty term. In float32 no u
+/// counts as grown: near a null space every u is that large, and it may be the best there is.
 template <class Space, class Method>
 auto have_grown(Space& space, const Method& method, const typename Space::States& states) {
   auto grown = space.map(states, [](const SampleState&) { return false; });
   if (space.epsilon() > 1e-10) return grown;
   const auto floors = rounding_floors(space, method);
   const auto definite = space.surely_definite();
-  // All but GMRES may be on their way, in a system as badly conditioned: they are given a hundred times as much.
+  // In a badly conditioned system a method other than GMRES may still be on its way: its bound is 100 times as large.
   const double bound = largest_floor(space) * (kMayExhaust<Method> ? 1.0 : 100.0);
   bool any = false;
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
-    grown[i] = !definite[i] && s.floor2 == 0.0 && s.residual2 > 1e-4 * s.b2 && floors[i] > bound * std::sqrt(s.b2);
+    grown[i] = !definite[i] && s.floor2 == 0.0 && is_far_from_solved(s) && floors[i] > bound * std::sqrt(s.b2);
     any = any || grown[i];
   }
   if (!any) return grown;
@@ -181,7 +181,7 @@ template <class Space, class Method>
 void judge_growth(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) {
     const bool ended = kMayExhaust<Method> ? s.status == SolveStatus::kStagnated : is_unsolved(s.status);
-    return ended && s.returned == Returned::kLast && s.residual2 > 1e-4 * s.b2;
+    return ended && s.returned == Returned::kLast && is_far_from_solved(s);
   };
   if (std::none_of(states.begin(), states.end(), is_doubtful)) return;
   const auto grown = have_grown(space, method, states);
@@ -199,11 +199,17 @@ template <class Method, class Space>
 bool has_lost_residual(const Space& space, const SampleState& s) {
   if constexpr (!kNeverGrows<Method>) return false;
   else
-    return !space.is_preconditioned() && is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2 &&
-           s.residual2 > 1.1 * s.best2;
+    return !space.is_preconditioned() && is_unsolved(s.status) && is_far_from_solved(s) && s.residual2 > 1.1 * s.best2;
 }
 
-/// Which iterate each sample is to hand out; returns whether all hand out their last.
+/// Which iterate each sample is to hand out; returns whether all hand out their last. In this order:
+///   1. A sample whose residual is above ‖b‖, or lost, is doubted: kBestOrZero. The others begin at kLast.
+///   2. accept_at_rounding_floor() gives kLast back to those at rounding. Of a direct method,
+///      judge_numerical_singularity() may do so too, or sets kZero; who is still doubted is a BREAKDOWN.
+///      accept_by_energy() gives kLast to all doubted that did not break down, with DIVERGED where the energy does not
+///      fall. judge_growth() sets kZero where u has grown.
+///   3. Of those at kLast, what ran away goes back to kBestOrZero, DIVERGED of step 2 included; others may get kBest or
+///      kBeforeBreakdown.
 template <class Space, class Method>
 bool choose_answers(Space& space, Method& method, typename Space::States& states, bool track) {
   for (auto& s : states) {
@@ -240,8 +246,9 @@ void run_again(Space& space, Method& method, typename Space::States& states, dou
   run(space, method, states, rtol, track);
 }
 
-/// Where the iterate of least recursive residual has a true one that is above ‖b‖, or lost: of it and those after half
-/// as many iterations, a quarter and so on, takes the one of least true residual, or zero.
+/// For samples whose best iterate, by the recursive residual, has a true one above ‖b‖, or has lost it: runs them again
+/// for a half of its iterations, a quarter and so on. Of these iterates, the best one and zero, it takes the one with
+/// the least true residual.
 template <class Space, class Method>
 void take_least_of_halves(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   const auto is_lost = [&](const SampleState& s) { return track && has_lost_residual<Method>(space, s); };

@@ -13,7 +13,8 @@
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/steepest_descent.h"
 
-/// The table of methods. Whatever the library wants to know about a method, it reads here.
+/// The table of methods. Whatever the library wants to know about a method, it reads here; what a class says of itself
+/// to the loop is in method_properties.h. CONTRIBUTING.md says how to add a method.
 namespace prdp {
 
 /// What max_iter counts: iterations, or cycles, each of which builds up as many vectors as `restart` says.
@@ -45,7 +46,7 @@ struct MethodTraits {
   /// fixes. Then u is smooth in A and linear in b, and the transposed map is as many iterations with Aᵀ and M⁻ᵀ.
   bool is_polynomial = false;
   bool ends_at_unknowns = false;  // exact after as many iterations as unknowns, and smooth up to there
-  bool nears_breakdowns = false;  // its recurrence may, even where A is well conditioned, and amplify rounding there
+  bool nears_breakdowns = false;  // even of a well-conditioned A, and amplifies rounding there
   /// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h);
   /// else autograd does it, in plain tensor operations.
   bool has_tape = true;

@@ -46,7 +46,7 @@ struct SampleState {
   int64_t false_claims = 0;
   double rejected2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at rounding, the square of that: ε ‖A‖ ‖u‖, or what verdicts.h takes for it
-  double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
+  double rounding2 = 0.0;  // the square of how far rounding to the least numbers of its dtype may have moved b
   Returned returned = Returned::kLast;
 
   /// Lets the first cycle end once the estimate of its residual is a tenth of rtol ‖b‖: rounding moves it less.
@@ -63,7 +63,8 @@ struct SampleState {
   }
   /// The last one changed nothing. A method may break down before the first.
   void take_back_iteration() { iterations = std::max<int64_t>(iterations - 1, 0); }
-  /// Back to the start, for another pass of at most `iterations_allowed`.
+  /// Back to the start, for another pass of at most `iterations_allowed`. `best`, `returned` and `applications` stay:
+  /// they are of all passes.
   void rewind(int64_t iterations_allowed) {
     cap = iterations_allowed;
     active = cap > 0;

@@ -22,8 +22,8 @@ namespace prdp {
 template <class Space, class X>
 using ArrayOf = decltype(std::declval<const Space&>().template array<X>(int64_t{}));
 
-/// The arrays that a method's members take: entries of those of vectors and of numbers, and how many arrays. A kernel
-/// of a GPU has memory for no more.
+/// What a method asks of array(), summed over its members: entries in arrays of vectors, entries in arrays of numbers,
+/// and how many arrays. A kernel of a GPU has memory for exactly this.
 struct ArraySizes {
   int64_t vectors = 0, numbers = 0, arrays = 0;
 };
@@ -44,7 +44,8 @@ concept Primitives =
       { s.b() } -> std::convertible_to<typename S::Vector>;
       /// ‖b()‖² as it is now; the norm of the original right-hand side is SampleState::b2.
       { s.b2() } -> std::convertible_to<typename S::Scalar>;
-      /// Entries of a vector; unit roundoff, which is half the ε of the comments below.
+      /// Entries of a vector; the unit roundoff. It is ε in skeel_estimate2() and in the loop around the methods, and
+      /// ε/2 in guarded_quotient(), breaks_down() and damp().
       { s.unknowns() } -> std::same_as<int64_t>;
       { s.epsilon() } -> std::same_as<double>;
 
@@ -151,7 +152,8 @@ concept KrylovSpace =
              typename S::Scalar b, typename S::Scalar left2, typename S::Scalar taken2, typename S::Scalar loss,
              typename S::Scalar scale, typename S::Scalar keep, const typename S::Scalar* R,
              const typename S::Scalar* g, typename S::Scalar* h) {
-      /// h_i = v_i·(a x) for the first n of v, as constants.
+      /// h_i = v_i·(a x) for the first n of v. They are constants, as is all that is called so here: on a tape and in
+      /// autograd they have no derivative.
       s.dots(v, n, a, x, h);
       /// x = a x - Σ h_i v_i with a constant a; returns ‖x‖² as a constant.
       { s.subtract_combination(h, v, n, a, x) } -> std::same_as<typename S::Scalar>;
@@ -189,7 +191,8 @@ concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, 
   s.solve_directly(x, y);
   /// Estimates Skeel's ‖|A⁻¹| |A| |u|‖²; times ε² it is the square of the error of u that rounding of A causes.
   { s.skeel_estimate2(x) } -> std::same_as<typename S::Scalar>;
-  /// Whether the factors of A are positive definite for sure, of each sample, and x = A⁻¹ b has what A is held by.
+  /// Of each sample: whether A is positive definite for sure, and so are its factors, which have lost neither the shift
+  /// nor the sides that hold u: Σ (row sum) x agrees with Σ b for x = A⁻¹ b.
   s.definite_factors(x);
 };
 
@@ -202,12 +205,11 @@ template <class S>
 concept LoopSpace =
     Primitives<S> && requires(S s, typename S::Vector x, typename S::Vector kept, typename S::Scalar a, int64_t n,
                               typename S::States states, bool (*wanted)(const typename S::States::value_type&)) {
-      /// One number per sample, on the host: a; whether it broke down; ‖A‖; whether A is known to be positive definite,
-      /// and rounding does not change that.
+      // One number per sample, on the host:
       s.values_of(a);
-      s.broken();
-      s.operator_norm();
-      s.surely_definite();
+      s.broken();           // whether it broke down
+      s.operator_norm();    // ‖A‖
+      s.surely_definite();  // whether A is known to be positive definite, and rounding does not change that
       /// ‖u‖², where u is x and the start.
       { s.solution2(x) } -> std::same_as<typename S::Scalar>;
       /// Estimates ‖|A| |u|‖² from below as ‖A S u‖², where S is a diagonal of ±1: those of is_negated_in() for attempt

@@ -81,13 +81,16 @@ inline bool left_rounding_of_b(const SampleState& s) {
 /// It went on and got worse: of a direct method, whose first solve is the most accurate where refining adds rounding.
 inline bool was_better(const SampleState& s) { return s.best > 0 && s.best < s.iterations && s.residual2 > s.best2; }
 
+/// The residual is above ‖b‖/100.
+inline bool is_far_from_solved(const SampleState& s) { return s.residual2 > 1e-4 * s.b2; }
+
 /// The residual is above ‖b‖: zero would be a better answer.
 inline bool is_above_b(const SampleState& s, double epsilon) { return s.residual2 > (1.0 + 256.0 * epsilon) * s.b2; }
 
 // ---- the limits of the dtype
 
-/// Share of b in the null space that is still rounding, or of no account beside rtol. In float64 that of a b from which
-/// a mean some 1e5 times its size was taken.
+/// Share of b in the null space that is still rounding, or of no account beside rtol. In float64, 1e-10 is what a mean
+/// 1e5 times the size of b leaves where it is taken off.
 template <class T>
 T consistency_bound(double rtol) {
   constexpr double rounding = std::max(1e-10, 64.0 * static_cast<double>(std::numeric_limits<T>::epsilon()));
@@ -115,7 +118,8 @@ auto start_gains_more_than_rounding(const Number& b2, const Number& left2, const
   return sqrt(b2) - sqrt(left2) > 4.0 * rounding;
 }
 
-/// What A cannot reach of b, as nobody named its null space, is no failure where the rounding of b may be the cause.
+/// A DIVERGED or BREAKDOWN whose residual is no more than the rounding of b is excused: but for that rounding, b may
+/// lie in the range of A.
 inline void excuse_rounding_of_b(SampleState& s) {
   const bool failed = s.status == SolveStatus::kDiverged || s.status == SolveStatus::kBreakdown;
   if (!failed || !(s.residual2 <= s.rounding2)) return;

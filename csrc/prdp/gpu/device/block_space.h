@@ -250,7 +250,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     }
   }
   PRDP_NOINLINE T entry_of_product(const T* v, int i) const { return a_.product(v, i); }
-  /// next = x + c - D⁻¹A x; with omega, next = next + omega (that - next). tell(i, c_i - (D⁻¹A x)_i)
+  /// Jacobi: next = x + change, where change = c - D⁻¹A x. Chebyshev, with omega: next holds the iterate before x and
+  /// becomes next + omega (x + change - next). Calls tell(i, change_i).
   template <class Tell>
   void sweep(const T* c, const T* x, Vector next, const T* omega, const Tell& tell) {
     const A a = a_;  // as in product()
@@ -287,7 +288,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   }
   /// Whether products are projected, and on a single vector: the sum for that goes along with others.
   bool projects_on_one() const { return needs_projection_ && left_null_space_.count * left_null_space_.fields == 1; }
-  /// The sums over the team; that of the last, the part along that vector, only where there is one.
+  /// Sums over the team. The last of s is the part along the single null vector; without one it is not summed.
   template <int n>
   void sum_with_part(T (&s)[n]) {
     if (projects_on_one()) return team_.sum(s);
@@ -296,14 +297,14 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     team_.sum(others);
     for (int k = 0; k < n - 1; ++k) s[k] = others[k];
   }
-  /// Removes the component of v in null(Aᵀ) if it is above ε/8 ‖v‖, where ‖v‖² = vv; returns the new ‖v‖². `along`: the
-  /// component along the vector, where there is only one.
+  /// Takes v's part in null(Aᵀ) off if it is above ε/8 ‖v‖; vv is ‖v‖², and the new one is returned. `along` is that
+  /// part where projects_on_one(); else it is found here.
   PRDP_NOINLINE T projected(Vector v, T vv, T along) {
     const T negligible = std::numeric_limits<T>::epsilon() / 8 * std::sqrt(vv);
     if (!projects_on_one()) along = project(left_null_space_, v, negligible);
     else if (!(std::abs(along) <= negligible)) take_off(left_null_space_, 0, 0, along, v);
     else return vv;
-    return along * along < vv / 2 ? vv - along * along : dot(v, v);
+    return along * along < vv / 2 ? vv - along * along : dot(v, v);  // a difference of near numbers has few digits
   }
   PRDP_NOINLINE const T* solution(const T* x) {
     if (!started_) return x;

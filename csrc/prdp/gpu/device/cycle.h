@@ -149,8 +149,7 @@ struct Cycle {
     /// Adds the solution of the coarser grid to that of this one, smooths, and returns it.
     PRDP_NOINLINE const T* go_up(int level, const T* coarse) {
       vectors = level == 0 ? finest : vectors_of(level);
-      // On the way down smooth() swapped x and y once for each step but the first.
-      if (level > 0 && cycle.hierarchy.smoothing % 2 == 0) std::swap(vectors.x, vectors.y);
+      if (level > 0 && swapped_on_the_way_down()) std::swap(vectors.x, vectors.y);  // `finest` was kept after the swaps
       const CoarseGrid& here = grid(level);
       for (int axis = 2; axis >= 0; --axis) {
         if (!here.is_coarsened(axis)) continue;
@@ -211,6 +210,7 @@ struct Cycle {
           y[i] = left;
           return;
         }
+        // In the first step p is 0 and y holds no iterate: 0 (x - y) could be NaN.
         const T before = p == T(0) ? T(0) : p * (x[i] - y[i]);
         y[i] = x[i] + before + q * left / level.diagonal(i);
       });
@@ -250,6 +250,9 @@ struct Cycle {
 
     const CoarseGrid& grid(int level) const { return cycle.grids().grid[level]; }
     bool transposed() const { return cycle.hierarchy.transposed != 0; }
+    /// Whether smooth() from zero, which swaps x and y in every step but the first, has left them in each other's
+    /// place.
+    bool swapped_on_the_way_down() const { return cycle.hierarchy.smoothing % 2 == 0; }
     const T* right_hand_side(int level) const { return level == 0 ? r : vectors.b; }
     const T* diagonals(int level) const {
       return cycle.numbers(grid(level).coefficients) + int64_t{Stencil::kCentre} * grid(level).points();

@@ -167,7 +167,8 @@ class HierarchyMaker {
   }
 
   /// Of a symmetric operator, interpolation and restriction are the same; else interpolation comes from the symmetric
-  /// part and restriction from the transpose (Dendy 1983).
+  /// part and restriction from the transpose (Dendy 1983). Writes fields of line.weights() numbers: those of
+  /// interpolation from the left and the right; and where A is not symmetric, those of restriction.
   PRDP_NOINLINE void make_weights(const Stencil& a, const CoarsenedAxis& line, int axis, T* to) {
     const int n = a.points(), weights = line.weights();
     const T* const entry = a.coefficients;
@@ -203,7 +204,8 @@ class HierarchyMaker {
         for (int dx = -reach(2); dx <= reach(2); ++dx) f(Stencil::place(dz, dy, dx), {dz, dy, dx});
   }
 
-  /// The index of the weights of point `between`, in the column at this offset from a fine point; -1 beyond the grid.
+  /// From fine point `fine`, go by `offset` in the other axes, and along the axis to point `between`: the index of the
+  /// weights there; -1 beyond the grid.
   static int weight_of_column(const Stencil& a, const CoarsenedAxis& line, int axis, int fine, const int (&offset)[3],
                               int between) {
     const int point[3] = {fine / (a.shape[1] * a.shape[2]), fine / a.shape[2] % a.shape[1], fine % a.shape[2]};
