@@ -79,6 +79,9 @@ TABLE = [
                            (r"GMRES\(10\)", prdp.GMRES(9)), ("Direct", prdp.Direct()))],
     ("OVERFLOW", 0.1 * torch.eye(2).double(), 1.7e308 * E1, prdp.CG(9),
      r"CG on Matrix: a number left the range of float64 .*; scale A and b"),
+    *[("OVERFLOW", (0.1 * torch.eye(3) + 0.9).to(dtype), torch.ones(3, dtype=dtype), prdp.Jacobi(1500, rtol=0.0),
+       rf"the iterates grew beyond the range of {name} \(‖A‖ is 2.8, .*\), as an eigenvalue of .*; take GMRES")
+      for name, dtype in (("float32", torch.float32), ("float64", torch.float64))],
     ("NONFINITE_INPUT", operators.Heat((8,), 1e-3, 1.0), GRID / 0.0, prdp.Chebyshev(9),
      r"at index \(0, 0\), Chebyshev on Heat: the right-hand side is NaN or Inf there; look at the state"),
     ("NONFINITE_INPUT", operators.Poisson((8,)), GRID * torch.nan, prdp.CG(9), "CG on Poisson: the right-hand side"),

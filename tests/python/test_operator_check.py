@@ -296,3 +296,18 @@ def test_entries_of_zero_are_looked_at_and_still_water_is_right():
 
     still = torch.zeros(1, 20, dtype=torch.float64, requires_grad=True)
     assert prdp.check_operator(operators.Function(upwind, tensors=(still,)), example)
+
+
+@pytest.mark.parametrize("boundary", ["flux", "periodic"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_diffusion_that_nothing_holds_has_a_right_gradient(boundary, dtype):
+    kappa = 0.5 + torch.rand(2, 6, 5, dtype=dtype, generator=torch.Generator().manual_seed(0))
+    A = operators.Diffusion(kappa, shift=0.0, boundary=boundary)
+    assert prdp.check_operator(A, torch.ones(2, 1, 6, 5, dtype=dtype))
+
+
+def test_a_diffusion_that_a_solve_refuses_is_refused_in_the_same_words():
+    kappa = torch.ones(1, 6, 5, dtype=torch.float64)
+    A = operators.Diffusion(kappa, shift=torch.zeros_like(kappa), boundary="flux")
+    with pytest.raises(ValueError, match="neither the shift nor a side holds u, so A is singular"):
+        prdp.check_operator(A, kappa[:, None])

@@ -264,3 +264,12 @@ def test_small_rows_beside_those_of_the_identity(dtype, always):
     (u, info), said = warnings_of(lambda: prdp.linear_solve(a, b, prdp.GMRES(100, restart=30)))
     assert info.solved.all() and len(said) == 1 and "u is off by at least about" in said[0]
     assert ((u - exact) * water[:, None]).abs().max() > 0.5 * (exact * water[:, None]).abs().max()
+
+
+@pytest.mark.parametrize("rtol", [0.03, 0.1, 0.2])
+def test_channels_of_equal_size_are_not_called_small(rtol, always):
+    a = operators.Diffusion(torch.ones(1, 16, 16, dtype=F64), shift=10.0)
+    for seed in range(20):
+        b = torch.randn(1, 2, 16, 16, dtype=F64, generator=torch.Generator().manual_seed(seed))
+        _, said = warnings_of(lambda b=b: prdp.linear_solve(a, b, prdp.CG(500, rtol=rtol)))
+        assert not said, (seed, said)

@@ -222,3 +222,29 @@ def test_a_mean_of_b_is_told_whether_u_has_grown_or_not(k):
     b = torch.randn(1, n, dtype=F64, generator=torch.Generator().manual_seed(0))
     _, info = prdp.linear_solve(a, b, prdp.BiCGStab(k, 1e-8), on_failure="return")
     assert info.status.item() == prdp.SolveStatus.INCONSISTENT
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("shape", [(3, 3), (6, 3), (4, 4, 4)])
+@pytest.mark.parametrize("share", [1e-2, 1.0])
+def test_a_constant_that_grows_within_few_products_is_told(shape, share, dtype):
+    # Few distinct eigenvalues: CG is through after five products, and stagnates after some twenty.
+    axes = torch.eye(len(shape), dtype=torch.long)
+    offsets = [(0,) * len(shape), *map(tuple, torch.cat([-axes, axes]).tolist())]
+    values = torch.full((1, len(offsets), *shape), -1.0, dtype=dtype)
+    values[:, 0] = len(offsets) - 1
+    a = operators.Stencil(values, offsets, boundary="periodic")
+    for seed in range(10):
+        b = torch.randn(1, 1, *shape, dtype=F64, generator=torch.Generator().manual_seed(seed))
+        b = (b - b.mean() + share).to(dtype)
+        u, info = prdp.linear_solve(a, b, prdp.CG(2000), on_failure="return")
+        assert bool(info.failed.all()), (seed, info, float(u.norm()))
+
+
+def test_bicgstab_on_a_markov_generator_is_told_of_both_null_spaces():
+    rates = torch.rand(50, 50, dtype=F64, generator=torch.Generator().manual_seed(0)).fill_diagonal_(0)
+    a = torch.diag(rates.sum(1)) - rates
+    b = torch.randn(1, 50, dtype=F64, generator=torch.Generator().manual_seed(1))
+    with pytest.warns(UserWarning, match="A maps the constant to zero, so it is singular; name both null spaces"):
+        _, info = prdp.linear_solve(a, b, prdp.BiCGStab(500))
+    assert float(info.residual) > 1e-2

@@ -270,8 +270,9 @@ class SampleVjps {
     if (options_.adjoint_log != 0) adjoint_log::write(options_.adjoint_log, info);
     auto transpose = spec_;
     transpose.transposed = !spec_.transposed;
-    report_failures({transpose, options_.solver, /*adjoint=*/true}, *make_operator(transpose), cotangent_,
-                    info_of(failures, solved_.b.scalar_type()), options_.on_failure);
+    const SolveRole role{transpose, options_.solver, /*adjoint=*/true, /*x0=*/{}, /*unrolled=*/true};
+    report_failures(role, *make_operator(transpose), cotangent_, info_of(failures, solved_.b.scalar_type()),
+                    options_.on_failure);
     for (auto* part : info.parts()) *part = part->to(solved_.b.device());
     return info;
   }

@@ -43,7 +43,7 @@ double operator_norm(const FailedSample& sample) {
   return norm.reshape({-1})[is_shared ? 0 : sample.index].to(at::kDouble).item<double>();
 }
 
-// A cause that may not be there: in words, or empty.
+// Causes that may not be there: in words, or empty.
 
 /// The rows of A, or its columns, differ so much in size that the dtype loses the small ones beside the large ones.
 std::string badly_scaled(const FailedSample& sample, bool columns) {
@@ -158,18 +158,20 @@ bool loses_coarse_grids(const FailedSample& sample) {
 
 // One function for each status.
 
-std::string diverged(const FailedSample& sample) {
+/// Why iterates run away, and what to do, after a statement of what they did.
+std::string why_iterates_grow(const FailedSample& sample) {
   switch (sample.method().made_for) {
-    case MadeFor::kDominant:
-      return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take "
-             "GMRES";
-    case MadeFor::kDefinite: return "the residual grew beyond ‖b‖: " + not_definite(sample);
+    case MadeFor::kDominant: return ", as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES";
+    case MadeFor::kDefinite: return ": " + not_definite(sample);
     default:
-      if (loses_coarse_grids(sample)) return c10::str("the residual grew beyond 1e13 ‖b‖: ", kLostCoarseGrids);
-      return c10::str(
-          "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct",
-          if_singular());
+      if (loses_coarse_grids(sample)) return c10::str(": ", kLostCoarseGrids);
+      return "; take GMRES with a larger restart, a preconditioner, or Direct" + if_singular();
   }
+}
+
+std::string diverged(const FailedSample& sample) {
+  const bool may_grow_to_b = sample.method().made_for == MadeFor::kDefinite;
+  return c10::str("the residual grew beyond ", may_grow_to_b ? "" : "1e13 ", "‖b‖", why_iterates_grow(sample));
 }
 
 std::string overflow(const FailedSample& sample) {
@@ -179,11 +181,17 @@ std::string overflow(const FailedSample& sample) {
                     sample.preconditioner().is_multigrid() ? ", as multigrid is not where A is not" : "",
                     "; take MINRES without it");
   const double norm = operator_norm(sample), norm_b = norm_of(sample.of(sample.b));
-  const bool known = norm > 0.0;
-  if (!known && !all_finite(sample.row_sums()))
+  if (!(norm > 0.0) && !all_finite(sample.row_sums()))
     return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
-  const auto sizes = (known ? "‖A‖ is " + three_digits(norm) + ", " : "") + "‖b‖ is " +
+  const auto sizes = (norm > 0.0 ? "‖A‖ is " + three_digits(norm) + ", " : "") + "‖b‖ is " +
                      (std::isinf(norm_b) ? "above 1.8e+308" : three_digits(norm_b));
+  if (sample.role.adjoint && sample.role.unrolled)
+    return c10::str("a number left the range of ", sample.precision(), " in the derivative of the iterations; take ",
+                    in_language("backward=\"implicit\"", "Backward::kImplicit"), ", which does not differentiate them");
+  const auto is_moderate = [](double n) { return n > 1e-12 && n < 1e12; };  // far from the limits of any dtype
+  if (!sample.method().is_direct && is_moderate(norm) && is_moderate(norm_b))
+    return c10::str("the iterates grew beyond the range of ", sample.precision(), " (", sizes, ")",
+                    why_iterates_grow(sample));
   return c10::str("a number left the range of ", sample.precision(), " (", sizes, "); ",
                   sample.is_single() ? "take float64, or scale A and b" : "scale A and b");
 }
@@ -239,7 +247,8 @@ std::string stagnated(const FailedSample& sample) {
                     if_singular());
   const char* another = method == Method::kDirect ? "take an iterative method"
                         : multigrid               ? "take another preconditioner than multigrid, or Direct"
-                                                  : "take another preconditioner or Direct";
+                        : sample.preconditioner() ? "take another preconditioner, or Direct"
+                                                  : "take a preconditioner, or Direct";
   return c10::str("the residual falls no further in ", sample.precision(), ", and u may be wrong; ",
                   single ? "solve it in float64 once to see, and if it is, stay there, or " : "", another,
                   ", or scale A and b so that their rows are of one size");
@@ -263,7 +272,9 @@ std::string max_iter_reached(const FailedSample& sample) {
                     single ? "solve it in float64 once to see" : "scale A and b",
                     ", or refine it by a larger max_iter");
   if (sample.method().made_for == MadeFor::kSymmetric)
-    return "take CG if A is positive definite; else more iterations, a preconditioner, float64 or Direct";
+    return c10::str("take CG if A is positive definite; else more iterations, a preconditioner",
+                    single ? ", float64" : "", " or Direct");
+  if (sample.method().counts == Counts::kCycles) return "take a larger restart, a preconditioner, or Direct";
   return "take more iterations, a preconditioner, GMRES or Direct";
 }
 
@@ -303,10 +314,9 @@ std::string nonfinite_operator(const FailedSample& sample) {
 std::string cause_in_operator(const FailedSample& sample, SolveStatus status) {
   const bool broke_down = status == SolveStatus::kBreakdown;
   const bool failed = broke_down || status == SolveStatus::kDiverged;
-  const bool is_refused_input = status == SolveStatus::kNonfiniteInput || status == SolveStatus::kNonfiniteOperator;
-  if (!is_refused_input)
+  if (status != SolveStatus::kNonfiniteInput && status != SolveStatus::kNonfiniteOperator)
     if (auto found = empty_line(sample); !found.empty()) return found;
-  if (failed)
+  if (failed || is_unsolved(status))
     if (auto found = undeclared_null_space(sample); !found.empty()) return found;
   if (broke_down)
     if (auto found = lost_in_factors(sample); !found.empty()) return found;

@@ -12,6 +12,7 @@ struct SolveRole {
   const Solver& solver;
   bool adjoint;
   at::Tensor x0{};
+  bool unrolled = false;  // the derivative of iterations, in place of an adjoint solve
 };
 
 /// Raises c10::LinAlgError, warns or does nothing about failed samples, as `on_failure` says. The message names the

@@ -25,8 +25,8 @@ at::Tensor constant_shares(const at::Tensor& v) {
   return at::where(part <= subnormal_rounding(scale, v), 0.0, part / whole);
 }
 
-/// In fewer products than kFewProducts, rounding has hardly grown along a null space. After kManyProducts, those that
-/// tell whether there is one cost little beside the solve.
+/// In fewer products than kFewProducts, rounding has hardly grown along a null space, unless A has few eigenvalues and
+/// the solve stagnates. After kManyProducts, those that tell whether there is one cost little beside the solve.
 constexpr int64_t kFewProducts = 32, kManyProducts = 256;
 
 /// Whether rounding may grow in few products.
@@ -61,7 +61,8 @@ at::Tensor suspects_of(const SolveInfo& info, const SolveRequest& request) {
     const auto ended = static_cast<SolveStatus>(status[i]);
     const bool has_grown = ended == SolveStatus::kBreakdown && !traits(solver.method).is_direct && iterations[i] == 0;
     if (!is_unsolved(ended) && !has_grown) continue;
-    if (!rounding_grows_fast(solver) && products[i] < kFewProducts && !is_above_b(i)) continue;
+    const bool may_have_grown = rounding_grows_fast(solver) || products[i] >= kFewProducts || is_above_b(i);
+    if (!may_have_grown && ended != SolveStatus::kStagnated) continue;
     if (!suspects.defined()) suspects = at::zeros({batch}, at::kBool);
     suspects.mutable_data_ptr<bool>()[i] = true;
   }
