@@ -238,7 +238,7 @@ def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Itera
     kind, given = A.kind.removeprefix("singular_"), A.tensors
     if kind != A.kind:
         given = given[:-2]  # without its null spaces, which need not be those of the operator that is changed
-    if kind != A.kind == "singular_diffusion":  # without them, a diffusion that nothing holds is refused
+    if A.kind == "singular_diffusion":  # without them, a diffusion that nothing holds is refused
         given = [given[0], torch.where(given[1] == 0, 1.0, given[1]), *given[2:]]
     here: Tensor = torch.ops.prdp.apply(v, list(given), kind, A.shape, A.parameters, False)
     sizes = torch.maximum(here.abs(), A.apply(w).abs())

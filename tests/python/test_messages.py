@@ -171,3 +171,18 @@ def test_a_warning_comes_out_whatever_the_users_file_is_called(always):
     exec(compile(text, "/home/\udce9.py", "exec"), scope)
     with pytest.warns(UserWarning, match="MAX_ITER|ended far above"):
         scope["solve"](prdp, torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.ones(1, 2))
+
+
+def test_an_overflow_in_the_derivative_of_iterations_names_the_implicit_one():
+    generator = torch.Generator().manual_seed(0)
+    kappa = torch.where(torch.rand(2, 45, generator=generator) < 0.5, 1.0, 1000.0).requires_grad_()
+    b = torch.randn(2, 1, 45, generator=generator)
+    b = b - b.mean(-1, keepdim=True)
+    solver = prdp.GMRES(200, restart=70)
+    u, _ = prdp.linear_solve(operators.Diffusion(kappa, boundary="flux"), b, solver, backward="unrolled")
+    said = 'left the range of float32 in the derivative of the iterations; take backward="implicit"'
+    with pytest.raises(torch.linalg.LinAlgError, match=said):
+        u.square().sum().backward()
+    u, _ = prdp.linear_solve(operators.Diffusion(kappa, boundary="flux"), b, solver)
+    u.square().sum().backward()
+    assert kappa.grad.isfinite().all()

@@ -80,8 +80,7 @@ Rows misleading_a_bar(const OperatorSpec& spec, const std::vector<at::Tensor>& g
       const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch);
       for (int64_t i = 0; i < batch; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
     };
-    // By the numbers of each sample; by the whole tensor where samples share it; by both of a Function, which may do
-    // so.
+    // By the numbers of each sample; by the whole tensor where samples share it; a Function may do either: by both.
     if (of_samples) mark_by([&](const at::Tensor& t) { return t.reshape({batch, -1}).norm(2, 1); });
     if (!of_samples || is_function(spec)) mark_by([](const at::Tensor& t) { return t.norm(); });
   }

@@ -183,11 +183,11 @@ std::string overflow(const FailedSample& sample) {
   const double norm = operator_norm(sample), norm_b = norm_of(sample.of(sample.b));
   if (!(norm > 0.0) && !all_finite(sample.row_sums()))
     return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
-  const auto sizes = (norm > 0.0 ? "‖A‖ is " + three_digits(norm) + ", " : "") + "‖b‖ is " +
-                     (std::isinf(norm_b) ? "above 1.8e+308" : three_digits(norm_b));
-  if (sample.role.adjoint && sample.role.unrolled)
+  if (sample.role.unrolled)
     return c10::str("a number left the range of ", sample.precision(), " in the derivative of the iterations; take ",
                     in_language("backward=\"implicit\"", "Backward::kImplicit"), ", which does not differentiate them");
+  const auto sizes = (norm > 0.0 ? "‖A‖ is " + three_digits(norm) + ", " : "") + "‖b‖ is " +
+                     (std::isinf(norm_b) ? "above 1.8e+308" : three_digits(norm_b));
   const auto is_moderate = [](double n) { return n > 1e-12 && n < 1e12; };  // far from the limits of any dtype
   if (!sample.method().is_direct && is_moderate(norm) && is_moderate(norm_b))
     return c10::str("the iterates grew beyond the range of ", sample.precision(), " (", sizes, ")",

@@ -84,7 +84,7 @@ void warn_of_small_channels(const Look& look) {
       at::where(is_there, norms(look.residual) / of_b, 0.0).masked_fill(look.converged.logical_not().unsqueeze(1), 0.0);
   const auto worst = shares.argmax().item<int64_t>(), channels = shares.size(1);
   const double share = shares.flatten()[worst].item<double>();
-  const double much = std::max(0.05, 3.0 * look.role.solver.rtol);  // of b of equal size, some are just above rtol
+  const double much = std::max(0.05, 3.0 * look.role.solver.rtol);  // of equal channels some end just above rtol
   if (!(share > much)) return;
   warn_once(look.key("small channels"), share, [&](std::ostream& text) {
     text << look.beginning(worst / channels) << "in channel " << worst % channels << " alone |b - A u| is "

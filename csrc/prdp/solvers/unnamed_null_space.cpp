@@ -61,8 +61,9 @@ at::Tensor suspects_of(const SolveInfo& info, const SolveRequest& request) {
     const auto ended = static_cast<SolveStatus>(status[i]);
     const bool has_grown = ended == SolveStatus::kBreakdown && !traits(solver.method).is_direct && iterations[i] == 0;
     if (!is_unsolved(ended) && !has_grown) continue;
-    const bool may_have_grown = rounding_grows_fast(solver) || products[i] >= kFewProducts || is_above_b(i);
-    if (!may_have_grown && ended != SolveStatus::kStagnated) continue;
+    const bool may_have_grown =
+        ended == SolveStatus::kStagnated || rounding_grows_fast(solver) || products[i] >= kFewProducts || is_above_b(i);
+    if (!may_have_grown) continue;
     if (!suspects.defined()) suspects = at::zeros({batch}, at::kBool);
     suspects.mutable_data_ptr<bool>()[i] = true;
   }
