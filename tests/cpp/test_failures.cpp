@@ -39,8 +39,9 @@ TEST(Failures, NameOperatorSampleAndRemedy) {
   const auto e1 = at::tensor({1.0, 0.0}, at::kDouble), b3 = at::tensor({1.0, 2.0, 3.0}, at::kDouble);
   const double infinity = std::numeric_limits<double>::infinity();
   expect_said(prdp::matrix(strong), b3, prdp::Jacobi{500},
-              {"1 of 1 samples failed: sample 0 DIVERGED", "Jacobi on Matrix:", "larger than 1", "take GMRES"});
-  expect_said(prdp::matrix(swap), e1, prdp::Jacobi{5}, {"ZERO_DIAGONAL in row (0,)", "take GMRES"});
+              {"1 of 1 samples failed: sample 0 DIVERGED", "Jacobi on Matrix:", "larger than 1",
+               "take CG if A is positive definite, else MINRES"});
+  expect_said(prdp::matrix(swap), e1, prdp::Jacobi{5}, {"ZERO_DIAGONAL in row (0,)", "take MINRES"});
   expect_said(prdp::matrix(swap), e1, prdp::CG{.max_iter = 5},
               {"BREAKDOWN", "CG on Matrix:", "A is symmetric but not definite to float64: take MINRES"});
   expect_said(prdp::matrix(turn), e1, prdp::SteepestDescent{5},

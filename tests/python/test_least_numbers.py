@@ -171,3 +171,11 @@ def test_where_nobody_named_the_null_space_nothing_fails_either(method, dtype):
         assert not info.failed.any()
         if method not in ("jacobi", "steepest descent"):  # which are not done then
             assert left.abs().max() <= 64 * least + 1e-4
+
+
+def test_a_direct_solve_leaves_numbers_below_the_normal_ones_to_torch():
+    """Its factors flush them; nobody else asked for that."""
+    a = operators.Diffusion(torch.ones(1, 16, 16, dtype=torch.float64), shift=torch.rand(1, 16, 16).double())
+    prdp.linear_solve(a, torch.ones(1, 1, 16, 16, dtype=torch.float64), prdp.Direct())
+    least = torch.full((64,), 2.0, dtype=torch.float64) * 2.5e-310
+    assert (least > 0).all() and (least / 2 > 0).all()

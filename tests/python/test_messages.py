@@ -37,7 +37,7 @@ BUDGET = {"max_iter": 2000}
 BY_DIAGONAL = {"max_iter": 9, "preconditioner": "diagonal"}
 NOT_SYMMETRIC = r"A is not symmetric \(‖A v - Aᵀ v‖ is [\d.]+ ‖A v‖ for a v of no structure\); take GMRES"
 INDEFINITE = r"A is symmetric but not definite to float\d\d: take MINRES"
-RADIUS = r"as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES"
+RADIUS = r"as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take CG if A is positive definite, else MINRES"
 
 TABLE = [
     # status, operator, right-hand side, solver, what is said
@@ -65,7 +65,7 @@ TABLE = [
      r'GMRES\(10\) with preconditioner="diagonal" on NavierStokes: .* take GMRES without it'),
     ("ZERO_DIAGONAL", operators.Diffusion(1e20 ** torch.linspace(-1.5, 1, 8).view(1, 8)), torch.ones(1, 1, 8),
      prdp.CG(**BY_DIAGONAL), "it divides by the diagonal of A, whose least number is lost beside the largest; take"),
-    ("ZERO_DIAGONAL", SWAP, E1, prdp.Jacobi(9), r"in row \(0,\), Jacobi on Matrix: it divides by .*; take GMRES"),
+    ("ZERO_DIAGONAL", SWAP, E1, prdp.Jacobi(9), r"in row \(0,\), Jacobi on Matrix: it divides by .*; take MINRES"),
     ("ZERO_DIAGONAL", ZERO, GRID, prdp.Jacobi(9), r"in row \(0, 0\), Jacobi on Stencil: it divides by .*; take GMRES"),
     *[("INCONSISTENT", FLOW, flow_state(2.0), solver,
        rf"{name} on NavierStokes: [\d.]+ % of b is the mean of its pressure channel, which no flow can have")
@@ -80,7 +80,7 @@ TABLE = [
     ("OVERFLOW", 0.1 * torch.eye(2).double(), 1.7e308 * E1, prdp.CG(9),
      r"CG on Matrix: a number left the range of float64 .*; scale A and b"),
     *[("OVERFLOW", (0.1 * torch.eye(3) + 0.9).to(dtype), torch.ones(3, dtype=dtype), prdp.Jacobi(1500, rtol=0.0),
-       rf"the iterates grew beyond the range of {name} \(‖A‖ is 2.8, .*\), as an eigenvalue of .*; take GMRES")
+       rf"the iterates grew beyond the range of {name} \(‖A‖ is 2.8, .*\), as an eigenvalue of .*; take CG if")
       for name, dtype in (("float32", torch.float32), ("float64", torch.float64))],
     ("NONFINITE_INPUT", operators.Heat((8,), 1e-3, 1.0), GRID / 0.0, prdp.Chebyshev(9),
      r"at index \(0, 0\), Chebyshev on Heat: the right-hand side is NaN or Inf there; look at the state"),

@@ -98,27 +98,28 @@ KRYLOV = (
     r"A is (not symmetric \(‖A v - Aᵀ v‖ is [\d.]+ ‖A v‖ .*\); take GMRES"
     "|symmetric but not definite to float..: take MINRES)"
 )
+WEAKER = "(GMRES|CG if A is positive definite, else MINRES)"
 WAYS = {
     "nan": ("NONFINITE_INPUT", r" at index \(((0, )+1|1,)\), ",
             "the (right-hand side|cotangent) is NaN or Inf there; look at", PAIRS),
     "inf": ("NONFINITE_OPERATOR", r" at index \([\d, ]+\), ", "A is made of a NaN or Inf; look at the state",
             [(m, o) for m, o in PAIRS if o in ("Burgers", "NavierStokes", "Stencil", "Matrix", "CSR")]),
     "zero diagonal": ("ZERO_DIAGONAL", r" in row \([\d, ]+\), ",
-                      "(the pressure rows have a|it divides by the diagonal of A, which has a) zero.*; take GMRES",
+                      "(the pressure rows have a|it divides by the diagonal of A, which has a) zero.*; take [GM].*RES",
                       [(m, o) for m, o in PAIRS
                        if m in DIVIDING and o in ("NavierStokes", "Stencil", "Matrix", "CSR")]),
     "turn": ("BREAKDOWN", r" \(the iterate handed out has relative residual [\d.e-]+ after \d+ iterations\), ",
-             f"r·A r is zero for a residual r(: {KRYLOV}|, or u grew without end; take GMRES)",
+             f"r·A r is zero for a residual r(: {KRYLOV}|, or u grew without end; take {WEAKER})",
              [(m, o) for m in ("SteepestDescent", "CG", "BiCGStab") for o in ("Function", "Matrix", "CSR")]),
     "singular": ("BREAKDOWN", r" \(the iterate .*\), ",
                  "(A is singular to float64, or nearly so; GMRES solves it"
                  "|.*A is singular, and b lies outside its range[;,].* take a b"
-                 f"|.*{KRYLOV}|r·A r is zero for a residual r, or u grew without end; take GMRES)",
+                 f"|.*{KRYLOV}|r·A r is zero for a residual r, or u grew without end; take {WEAKER})",
                  [(m, o) for m in ("CG", "BiCGStab", "GMRES(3)", "Direct") for o in ("Function", "Matrix", "CSR")]
                  + [(m, o) for m in DIVIDING if m != "Jacobi" for o in ("Matrix", "CSR")]),
     "strong": ("DIVERGED", r" \(the iterate .*\), ",
                "the residual grew beyond (1e13 )?‖b‖"
-               f"(, as an eigenvalue of I - D⁻¹A is larger than 1.*; take GMRES|: {KRYLOV})",
+               f"(, as an eigenvalue of I - D⁻¹A is larger than 1.*; take {WEAKER}|: {KRYLOV})",
                [("Jacobi", "Stencil"), ("Jacobi", "Matrix"), ("Jacobi", "CSR"), ("SteepestDescent", "Stencil"),
                 ('CG with preconditioner="diagonal"', "Burgers")]),
     "mean pressure": ("INCONSISTENT", r" \(the iterate .*\), ",

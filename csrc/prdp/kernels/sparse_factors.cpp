@@ -9,6 +9,7 @@
 
 #include "prdp/kernels/cholesky_solve.h"
 #include "prdp/kernels/equilibration.h"
+#include "prdp/kernels/flush_subnormals.h"
 #include "prdp/threads/thread_to_leave.h"
 
 namespace prdp::kernels {
@@ -113,6 +114,7 @@ struct SparseFactors::Factorised {
 
   explicit Factorised(const Matrix& m) {
     if (m.rows() > 0 && has_empty_line(m)) return;
+    const FlushSubnormals flush;
     if (is_symmetric(m)) {
       if (m.rows() > 0 && m.coeff(0, 0) < 0.0) sign = -1.0;
       cholesky.emplace(Matrix(sign * m));
@@ -167,6 +169,7 @@ bool SparseFactors::is_regular() const { return factorised_->is_regular; }
 bool SparseFactors::gains_by_several() const { return factorised_->cholesky.has_value(); }
 
 void SparseFactors::solve(Eigen::Ref<Eigen::MatrixXd> x, bool transposed) const {
+  const FlushSubnormals flush;
   const auto& to_take = transposed ? kept_unknowns_ : kept_equations_;
   const auto& to_give = transposed ? kept_equations_ : kept_unknowns_;
   if (factorised_->cholesky) {

@@ -154,20 +154,34 @@ bool warn_of_growth(const Report& report) {
   return true;
 }
 
-/// Of samples that max_iter stopped far from the tolerance that was asked for. Returns whether there are any.
+/// Of samples that max_iter stopped far from the tolerance that was asked for; without one, of those whose iterates
+/// were all in vain. Returns whether there are any.
 bool warn_of_stopped(const Report& report) {
-  if (!(report.rtol() > 0.0)) return false;
-  const auto worse = report.samples_where([&](int64_t i) { return later_iterations_were_worse(report, i); });
-  if (worse.empty()) return warn_of_growth(report);
+  const bool has_tolerance = report.rtol() > 0.0;
+  const auto worse = report.samples_where([&](int64_t i) {
+    return later_iterations_were_worse(report, i) && (has_tolerance || report.iterations[i] == 0);
+  });
+  if (worse.empty()) return has_tolerance && warn_of_growth(report);
   const int64_t first = worse.front();
   report.warn("in vain: ", worse.size(), first, SolveStatus::kMaxIter, [&](std::ostream& text) {
-    text << "ended far above rtol = " << report.rtol() << ": sample " << first << " returned ";
+    if (has_tolerance) text << "ended far above rtol = " << report.rtol();
+    else text << "gained nothing";
+    text << ": sample " << first << " returned ";
     if (report.iterations[first] > 0) text << "iterate " << report.iterations[first];
     else text << (report.role.x0.defined() ? "its start" : "zero");
     text << " at relative residual " << report.residuals[first] << ", as the last of " << report.role.solver.max_iter
          << " iterates was worse";
   });
   return true;
+}
+
+/// Whether max_iter left a sample where it started. Only what the host has is looked at: nobody waits for a device.
+bool has_an_idle_sample(const SolveInfo& info) {
+  if (!info.iterations.is_cpu()) return false;
+  const auto *iterations = info.iterations.const_data_ptr<int64_t>(), *status = info.status.const_data_ptr<int64_t>();
+  for (int64_t i = 0; i < info.iterations.size(0); ++i)
+    if (iterations[i] == 0 && status[i] == static_cast<int64_t>(SolveStatus::kMaxIter)) return true;
+  return false;
 }
 
 /// Whether a sample is far from rtol after as many products as unknowns, in which a Krylov method should have ended.
@@ -233,7 +247,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
     const auto status = static_cast<SolveStatus>(s);
     return !is_solved(status) && (status != SolveStatus::kMaxIter || role.solver.rtol > 0.0);
   };
-  if (std::none_of(first, first + b.size(0), is_told)) return;
+  if (std::none_of(first, first + b.size(0), is_told) && !has_an_idle_sample(info)) return;
   const Report report(role, a, b, info);
   const auto failed = report.samples_where([&](int64_t i) { return is_failure(report.status(i)); });
   if (failed.empty()) {

@@ -104,30 +104,37 @@ OperatorSpec in_double(OperatorSpec spec, double rounding) {
   return spec;
 }
 
-/// How far u changes, as a share of its largest entry, when the solve goes on in float64 to a much smaller residual,
-/// for no more than about twice as many products. Where the rounding of A itself moves u as far, as along a null vector
-/// that nobody named, that says nothing: 0.
-at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const SolveInfo& info) {
-  constexpr double less = 1e-4, least = 1e-13;
+/// The solver of `look`, for a residual that is much smaller than the one it left, by no more than about twice as many
+/// products.
+Solver to_go_on(const Look& look, const SolveInfo& info) {
   auto solver = look.role.solver;
-  solver.rtol = std::max(less * solver.rtol, least);
+  solver.rtol = 1e-4;
   const int64_t products = 2 * info.operator_applications.max().item<int64_t>() + 20;
   const auto& method = traits(solver.method);
   const int64_t each = method.counts == Counts::kCycles ? solver.restart : method.products;
   solver.max_iter = (products + each - 1) / each;
-  const auto b = look.b.to(at::kDouble), u = look.u.to(at::kDouble), size = per_sample(sample_maxima(u), u);
-  const auto share_of = [&](const at::Tensor& v) { return ((v - u).abs() / size).nan_to_num(0.0, 0.0, 0.0); };
-  const auto go_on = [&](double rounding) {
-    return solve(*make_operator(in_double(look.role.a, rounding)), b, {.solver = solver, .x0 = u}).u;
+  return solver;
+}
+
+/// How far u changes, as a share of its largest entry, by a solve for its error. Where the rounding of A itself moves u
+/// as far, as along a null vector that nobody named, that says nothing: 0.
+at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const SolveInfo& info) {
+  const auto solver = to_go_on(look, info);
+  const auto u = look.u.to(at::kDouble), size = per_sample(sample_maxima(u), u);
+  const auto exact = make_operator(in_double(look.role.a, 0.0));
+  const auto change_by = [&](const Operator& of, const at::Tensor& part_of_b) {
+    const auto change = solve(of, of.project(part_of_b), {.solver = solver}).u;
+    return (change.to(at::kDouble).abs() / size).nan_to_num(0.0, 0.0, 0.0);
   };
-  const auto further = go_on(0.0);
-  auto changes = share_of(further);
+  const auto product = apply_on_loops(*exact, u, /*transposed=*/false);
+  auto changes = change_by(a, (look.b.to(at::kDouble) - product).to(look.b.scalar_type()));
   if (!(changes.max() > look.much()).item<bool>()) return changes;
   const bool keeps_null_space = look.role.a.kind == "singular_diffusion";  // the constant, whatever κ
-  auto is_free = keeps_null_space ? at::zeros({b.size(0)}, at::kBool)
+  auto is_free = keeps_null_space ? at::zeros({u.size(0)}, at::kBool)
                                   : maps_constant_to_zero(a, look.b, /*transposed=*/false, /*jointly=*/true);
   if (keeps_null_space || !is_singular(look.role.a)) {
-    const auto moved = share_of(go_on(epsilon_of(look.b)) - further + u);
+    const auto rounded = make_operator(in_double(look.role.a, epsilon_of(look.b)));
+    const auto moved = change_by(*exact, apply_on_loops(*rounded, u, /*transposed=*/false) - product);
     is_free = is_free.logical_or(sample_maxima(moved) > 0.3 * sample_maxima(changes));
   }
   return changes.masked_fill(per_sample(is_free, u), 0.0);
@@ -155,8 +162,11 @@ void warn_of_small_rows(const Look& look, const Operator& a, const SolveInfo& in
          << three_digits(spread) << " times as large as others, and a residual beside them tells little of these. Take "
          << in_language("Direct()", "Direct{}");
     const double enough = rtol * (rtol / worst);  // the error falls with rtol, here to about rtol
-    if (enough > 100.0 * epsilon_of(look.b))
-      text << " or a smaller " << (adjoint ? "adjoint_rtol" : "rtol") << ", such as " << three_digits(enough);
+    constexpr double least_in_double = 1e-13;
+    if (enough < least_in_double) return;
+    const bool fits = enough > 100.0 * epsilon_of(look.b);
+    text << (fits ? " or a smaller " : ", or float64 and a smaller ") << (adjoint ? "adjoint_rtol" : "rtol")
+         << ", such as " << three_digits(enough);
   });
 }
 

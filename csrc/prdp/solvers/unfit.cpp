@@ -47,12 +47,20 @@ bool needs_symmetry(Method method) {
   return made_for == MadeFor::kDefinite || made_for == MadeFor::kSymmetric;
 }
 
+/// How much asymmetry() of a symmetric A may be.
+double rounding_of_asymmetry(const FailedSample& sample) {
+  return is_function(sample.role.a) ? rounding_of_differences(sample.b) : 100.0 * epsilon_of(sample.b);
+}
+
 }  // namespace
+
+bool is_symmetric(const FailedSample& sample) {
+  return asymmetry(sample.a, sample.b, sample.index) <= rounding_of_asymmetry(sample);
+}
 
 std::string asymmetric(const FailedSample& sample) {
   const double share = asymmetry(sample.a, sample.b, sample.index);
-  const double rounding = is_function(sample.role.a) ? rounding_of_differences(sample.b) : 100.0 * epsilon_of(sample.b);
-  if (!(share > rounding)) return {};
+  if (!(share > rounding_of_asymmetry(sample))) return {};
   return "A is not symmetric (‖A v - Aᵀ v‖ is " + three_digits(share) + " ‖A v‖ for a v of no structure); take GMRES";
 }
 

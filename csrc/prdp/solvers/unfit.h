@@ -6,6 +6,9 @@
 /// Whether A and a preconditioner of one's own are what a method is made for, as a few products tell.
 namespace prdp {
 
+/// Whether A is symmetric up to rounding; false where nobody knows, as of a function without a transpose.
+bool is_symmetric(const FailedSample& sample);
+
 /// Where A is not symmetric: that, in words. Else empty.
 std::string asymmetric(const FailedSample& sample);
 
