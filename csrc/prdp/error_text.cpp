@@ -31,6 +31,8 @@ std::string three_digits(double x) {
   return text.str();
 }
 
+std::string dtype_name(c10::ScalarType dtype) { return std::string(c10::getDtypeNames(dtype).first); }
+
 std::string as_tuple(c10::ArrayRef<int64_t> numbers) {
   std::ostringstream text;
   for (size_t i = 0; i < numbers.size(); ++i) text << (i ? ", " : "(") << numbers[i];

@@ -1,4 +1,5 @@
 #pragma once
+#include <c10/core/ScalarType.h>
 #include <c10/util/ArrayRef.h>
 
 #include <cstdint>
@@ -12,6 +13,9 @@ std::string sentence(std::string_view what);
 
 /// A number as messages give it: "1.23", "4e-05".
 std::string three_digits(double x);
+
+/// "float32", as PyTorch's users write it.
+std::string dtype_name(c10::ScalarType dtype);
 
 /// An index or an offset: "(0, -1)", or "(3,)" for one number.
 std::string as_tuple(c10::ArrayRef<int64_t> numbers);

@@ -226,7 +226,7 @@ CSR = (torch.arange(4), torch.arange(3), torch.ones(3))
     (lambda: prdp.linear_solve(torch.eye(3), torch.ones(2, 4, 3), prdp.Direct()), ValueError,
      "got [2, 4, 3]; the right-hand sides of one matrix are samples: b.flatten(0, 1)"),
     (lambda: heat().bfloat16()(torch.ones(1, 1, 30, dtype=torch.bfloat16)), TypeError,
-     "Heat: expected float32 or float64, got BFloat16; keep the step in float32, and let autocast take the network"),
+     "Heat: expected float32 or float64, got bfloat16; keep the step in float32, and let autocast take the network"),
     (lambda: prdp.linear_solve(torch.eye(3).repeat(2, 1, 1), torch.ones(3), prdp.Direct()), ValueError,
      "A holds 2 matrices, b holds 1 right-hand side; expand b, so that each has its own"),
 ])  # fmt: skip

@@ -125,7 +125,7 @@ def test_batch_axes_and_index_types_must_fit():
         solve([crow.expand(3, 3), col, values])
     with pytest.raises(ValueError, match="must have the same batch axis"):
         solve([crow.expand(2, 3), col.expand(3, 2), values.expand(3, 2)])
-    with pytest.raises(TypeError, match="indices of a CSR matrix must be int32 or int64, got Double"):
+    with pytest.raises(TypeError, match="indices of a CSR matrix must be int32 or int64, got float64"):
         solve([crow.double(), col, values])
     with pytest.raises(ValueError, match="indices and values of a CSR matrix must be on one device"):
         solve([crow.to("meta"), col, values])

@@ -41,7 +41,7 @@ def test_matrix_and_right_hand_side_must_fit():
         prdp.linear_solve(torch.eye(3), torch.zeros(2, 4), prdp.Jacobi(1))
     with pytest.raises(ValueError, match="A holds 5 matrices, b holds 2 right-hand sides"):
         prdp.linear_solve(torch.eye(3).expand(5, 3, 3), torch.zeros(2, 3), prdp.Jacobi(1))
-    with pytest.raises(TypeError, match="A is Double but b is Float"):
+    with pytest.raises(TypeError, match="A is float64 but b is float32"):
         prdp.linear_solve(torch.eye(3, dtype=torch.float64), torch.zeros(3), prdp.Jacobi(1))
     with pytest.raises(ValueError, match="A is on meta but b is on cpu"):
         prdp.linear_solve(torch.eye(3, device="meta"), torch.zeros(3), prdp.Jacobi(1))

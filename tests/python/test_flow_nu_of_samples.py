@@ -153,7 +153,7 @@ def test_a_batch_without_samples():
 
 
 def test_what_is_refused():
-    with pytest.raises(TypeError, match="Flow: nu must be real, got ComplexFloat"):
+    with pytest.raises(TypeError, match="Flow: nu must be real, got complex64"):
         prdp.Flow((8, 8), nu=torch.tensor(1j), dt=0.01)
     u = torch.zeros(3, 2, 8, 8)
     with pytest.raises(ValueError, match=r"Flow: nu holds 2 samples, u holds 3"):

@@ -174,7 +174,7 @@ def test_a_tensor_with_nan_stays_with_its_sample(backward):
         (
             lambda: solve_with(lambda v: v[:, 1:]),
             ValueError,
-            r"matvec must return what it was given, \[2, 4\] in Float",
+            r"matvec must return what it was given, \[2, 4\] in float32",
         ),
         (lambda: solve_with(lambda v: v.double()), ValueError, "matvec must return what it was given"),
         (lambda: solve_with(lambda v: None), TypeError, "matvec must return a torch tensor, got NoneType"),

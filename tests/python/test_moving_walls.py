@@ -266,7 +266,7 @@ BAD = {
         ValueError,
         "wall_velocity of side (0, 'low') must have shape (2,) or (batch or 1, 2, 6), got [1, 2, 8]",
     ),
-    "whole numbers": ({(0, "low"): torch.zeros(2, dtype=torch.int64)}, TypeError, "must hold real numbers, got Long"),
+    "whole numbers": ({(0, "low"): torch.zeros(2, dtype=torch.int64)}, TypeError, "must hold real numbers, got int64"),
 }
 
 

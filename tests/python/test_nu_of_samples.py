@@ -213,7 +213,7 @@ def test_mistakes():
     b = torch.zeros(3, 1, 9)
     with pytest.raises(ValueError, match="Heat: the values of nu hold 2 samples, the vector holds 3"):
         prdp.linear_solve(operators.Heat((9,), torch.ones(2), 0.1), b, prdp.CG(3))
-    with pytest.raises(TypeError, match="Heat: the values of nu are Double but the vector is Float"):
+    with pytest.raises(TypeError, match="Heat: the values of nu are float64 but the vector is float32"):
         prdp.linear_solve(operators.Heat((9,), torch.ones(3, dtype=F64), 0.1), b, prdp.CG(3))
     with pytest.raises(ValueError, match=r"Heat: nu must be a number, a 0-dimensional tensor, or \(batch,\), one for"):
         operators.Heat((9,), torch.ones(3, 1), 0.1)

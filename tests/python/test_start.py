@@ -222,7 +222,7 @@ def test_an_iteration_that_runs_away_hands_out_no_less_than_the_start(method):
     "x0, message",
     [
         (torch.zeros(2, 1, 6, dtype=torch.float64), r"x0 must have the shape, dtype and device of b, \[2, 1, 5\]"),
-        (torch.zeros(2, 1, 5), "got .* in Float"),
+        (torch.zeros(2, 1, 5), "got .* in float32"),
     ],
 )
 def test_a_start_that_does_not_fit_is_refused(x0, message):

@@ -225,7 +225,7 @@ C = torch.ones(2, 5, 4, 6)
 @pytest.mark.parametrize("make, error, message", [
     (lambda: operators.Stencil([1.0], NEAREST[2]), TypeError, "Stencil: coefficients must be a torch tensor"),
     (lambda: operators.Stencil(torch.ones(5, 4), NEAREST[2]), ValueError, r"\(batch or 1, k, \*shape\).*got \(5, 4\)"),
-    (lambda: operators.Stencil(C.int(), NEAREST[2]), TypeError, "coefficients must be float32 or float64, got Int"),
+    (lambda: operators.Stencil(C.int(), NEAREST[2]), TypeError, "coefficients must be float32 or float64, got int32"),
     (lambda: operators.Stencil(C, NEAREST[2][:4]), ValueError, "4 offsets need coefficients of shape .batch or 1, 4"),
     (lambda: operators.Stencil(C, NEAREST[1]), ValueError, r"every offset must have 2 entries.*got \(0,\)"),
     (lambda: operators.Stencil(C[0], NEAREST[2]), ValueError, r"1 entry.* \(0, 0\); .*so shape is \(\d+,\)"),
@@ -241,7 +241,7 @@ C = torch.ones(2, 5, 4, 6)
     (lambda: operators.Stencil(C, NEAREST[2], ["zero"]), ValueError, "one for all axes or one for each of 2"),
     (lambda: solve(C, field((4, 7))), ValueError, r"Stencil: expected \(batch, channel, 4, 6\), got \[2, 1, 4, 7\]"),
     (lambda: solve(C, field((4, 6), 3)), ValueError, "the coefficients hold 2 samples, the vector holds 3"),
-    (lambda: solve(C, field((4, 6))), TypeError, "the coefficients are Float but the vector is Double"),
+    (lambda: solve(C, field((4, 6))), TypeError, "the coefficients are float32 but the vector is float64"),
     (lambda: solve(C, torch.ones(2, 1, 4, 6, device="meta")), ValueError, "are on cpu but the vector is on meta"),
 ])  # fmt: skip
 def test_mistakes_are_named(make, error, message):

@@ -198,7 +198,7 @@ def test_vector_and_winds_must_fit():
         a.apply(field((8,)))
     with pytest.raises(ValueError, match="Burgers: the winds hold 3 samples, the vector holds 2"):
         prdp.linear_solve(a, field((8,)), prdp.Jacobi(3))
-    with pytest.raises(TypeError, match="Burgers: the winds are Double but the vector is Float"):
+    with pytest.raises(TypeError, match="Burgers: the winds are float64 but the vector is float32"):
         a.apply(field((8,), batch=3).float())
     with pytest.raises(ValueError, match="Burgers: the winds are on cpu but the vector is on meta"):
         a.apply(field((8,), batch=3).to("meta"))

@@ -86,7 +86,7 @@ def test_weights_that_do_not_fit_are_one_line_and_run_no_code(tmp_path):
     bomb = state | {"layers.0.weight": Bomb(str(tmp_path / "crater"))}
     for content, words in [
         (renamed, "weights: there is no tensor 'layers.0.weight'"),
-        (wide, "weights: tensor 'layers.0.weight' is Double of sizes [64, 30], expected Float of sizes [64, 30]"),
+        (wide, "weights: tensor 'layers.0.weight' is float64 of sizes [64, 30], expected float32 of sizes [64, 30]"),
         (less, "weights: there is no tensor 'layers.0.weight'"),
         (more, "weights: nobody knows its tensor 'more'"),
         (unknown, "weights: tensor 'layers.0.bias' holds NaN or Inf"),

@@ -9,6 +9,7 @@
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"
 #include "prdp/autograd/unreached_tensors.h"
+#include "prdp/error_text.h"
 #include "prdp/operators/function_checks.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
@@ -71,11 +72,11 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
   check_devices(spec, b);
   if (options.solver.preconditioner.is_operator()) check_devices(options.solver.preconditioner.spec(), b);
   check_multigrid(*a, spec, options.solver);
-  TORCH_CHECK_VALUE(
-      !x0.defined() ||
-          (x0.sym_sizes() == b.sym_sizes() && x0.scalar_type() == b.scalar_type() && x0.device() == b.device()),
-      role_of(spec), ": x0 must have the shape, dtype and device of b, ", b.sym_sizes(), " in ", b.scalar_type(),
-      " on ", b.device(), ", got ", x0.sym_sizes(), " in ", x0.scalar_type(), " on ", x0.device());
+  TORCH_CHECK_VALUE(!x0.defined() || (x0.sym_sizes() == b.sym_sizes() && x0.scalar_type() == b.scalar_type() &&
+                                      x0.device() == b.device()),
+                    role_of(spec), ": x0 must have the shape, dtype and device of b, ", b.sym_sizes(), " in ",
+                    dtype_name(b.scalar_type()), " on ", b.device(), ", got ", x0.sym_sizes(), " in ",
+                    dtype_name(x0.scalar_type()), " on ", x0.device());
   return a;
 }
 

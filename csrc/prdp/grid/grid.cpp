@@ -5,6 +5,8 @@
 #include <cmath>
 #include <numbers>
 
+#include "prdp/error_text.h"
+
 namespace prdp {
 
 const char* hint_of_dtype(at::ScalarType dtype) {
@@ -50,7 +52,7 @@ void Grid::check_field(const at::Tensor& v, int64_t channels) const {
                       other_fields ? "; fields of several channels are samples: u.flatten(0, 1).unsqueeze(1)" : "");
   }
   TORCH_CHECK_TYPE(v.scalar_type() == at::kFloat || v.scalar_type() == at::kDouble, owner_,
-                   ": expected float32 or float64, got ", v.scalar_type(), hint_of_dtype(v.scalar_type()));
+                   ": expected float32 or float64, got ", dtype_name(v.scalar_type()), hint_of_dtype(v.scalar_type()));
 }
 
 namespace {

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 
+#include "prdp/error_text.h"
 #include "prdp/gpu/operator_view.h"
 #include "prdp/gpu/part_of.h"
 #include "prdp/kernels/matrix.h"
@@ -43,7 +44,8 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
                     "linear_solve: A must have shape (n, n) or (batch, n, n)");
   for (const auto* index : {&crow, &col})
     TORCH_CHECK_TYPE(index->scalar_type() == at::kInt || index->scalar_type() == at::kLong,
-                     "linear_solve: indices of a CSR matrix must be int32 or int64, got ", index->scalar_type());
+                     "linear_solve: indices of a CSR matrix must be int32 or int64, got ",
+                     dtype_name(index->scalar_type()));
   TORCH_CHECK_VALUE(col.sym_size(-1) == values_.sym_size(-1),
                     "linear_solve: a CSR matrix needs as many columns as values, got ", col.sym_sizes(), " and ",
                     values_.sym_sizes());

@@ -71,8 +71,8 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
   for (const auto& [name, t] : tensors())
     TORCH_CHECK_VALUE(t.dim() == 0 || t.sym_size(0) == 1 || t.sym_size(0) == b.sym_size(0), "Diffusion: ", name,
                       " holds ", t.sym_size(0), " samples, the vector holds ", b.sym_size(0));
-  TORCH_CHECK_TYPE(b.scalar_type() == kappa_.scalar_type(), "Diffusion: kappa is ", kappa_.scalar_type(),
-                   " but the vector is ", b.scalar_type());
+  TORCH_CHECK_TYPE(b.scalar_type() == kappa_.scalar_type(), "Diffusion: kappa is ", dtype_name(kappa_.scalar_type()),
+                   " but the vector is ", dtype_name(b.scalar_type()));
   for (const auto& [name, t] : tensors())
     TORCH_CHECK_VALUE(t.device() == b.device() || (t.dim() == 0 && t.is_cpu()), "Diffusion: its tensors are on ",
                       t.device(), " but the vector is on ", b.device());

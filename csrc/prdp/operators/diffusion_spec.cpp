@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/singular_operator.h"
@@ -122,7 +123,7 @@ void DiffusionOperator::check_shapes(const std::vector<at::Tensor>& tensors) con
   TORCH_CHECK_VALUE(std::all_of(shape_.begin(), shape_.end(), [](int64_t n) { return n >= 1; }),
                     "Diffusion: every extent of shape must be >= 1, got ", at::IntArrayRef(shape_));
   TORCH_CHECK_TYPE(kappa.scalar_type() == at::kFloat || kappa.scalar_type() == at::kDouble,
-                   "Diffusion: kappa must be float32 or float64, got ", kappa.scalar_type());
+                   "Diffusion: kappa must be float32 or float64, got ", dtype_name(kappa.scalar_type()));
   TORCH_CHECK_VALUE(shift.dim() == 0 || is_batch_of(shift, shape_),
                     "Diffusion: shift must be a number or (batch or 1, *shape), got ", shift.sym_sizes());
 }

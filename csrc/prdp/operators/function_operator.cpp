@@ -28,8 +28,8 @@ at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* na
   TORCH_CHECK_VALUE(result.device() == v.device(), "Function: ", name, " must return a tensor on ", v.device(),
                     ", got one on ", result.device());
   TORCH_CHECK_VALUE(result.sizes() == v.sizes() && result.scalar_type() == v.scalar_type(), "Function: ", name,
-                    " must return what it was given, ", v.sizes(), " in ", v.scalar_type(), ", got ", result.sizes(),
-                    " in ", result.scalar_type());
+                    " must return what it was given, ", v.sizes(), " in ", dtype_name(v.scalar_type()), ", got ",
+                    result.sizes(), " in ", dtype_name(result.scalar_type()));
   return result;
 }
 
@@ -130,7 +130,7 @@ void FunctionOperator::check_vector(const at::Tensor& b) const {
   TORCH_CHECK_VALUE(std::find(extents.begin(), extents.end(), 0) == extents.end(),
                     "Function: every extent of a vector must be >= 1, got ", b.sizes());
   TORCH_CHECK_TYPE(b.scalar_type() == at::kFloat || b.scalar_type() == at::kDouble,
-                   "Function: expected a vector in float32 or float64, got ", b.scalar_type());
+                   "Function: expected a vector in float32 or float64, got ", dtype_name(b.scalar_type()));
   vectors_ = b.sizes().vec();
 }
 

@@ -21,9 +21,9 @@ void check_matrix_vector(const at::Tensor& b, const at::Tensor& values, int64_t 
                     " matrices, b holds ", b.size(0), " right-hand side", b.size(0) == 1 ? "" : "s",
                     b.size(0) == 1 ? "; expand b, so that each has its own" : "");
   TORCH_CHECK_TYPE(b.scalar_type() == at::kFloat || b.scalar_type() == at::kDouble,
-                   "linear_solve: expected b in float32 or float64, got ", b.scalar_type());
-  TORCH_CHECK_TYPE(b.scalar_type() == values.scalar_type(), "linear_solve: A is ", values.scalar_type(), " but b is ",
-                   b.scalar_type());
+                   "linear_solve: expected b in float32 or float64, got ", dtype_name(b.scalar_type()));
+  TORCH_CHECK_TYPE(b.scalar_type() == values.scalar_type(), "linear_solve: A is ", dtype_name(values.scalar_type()),
+                   " but b is ", dtype_name(b.scalar_type()));
   TORCH_CHECK_VALUE(b.device() == values.device(), "linear_solve: A is on ", values.device(), " but b is on ",
                     b.device());
 }

@@ -76,7 +76,7 @@ StencilOperator::StencilOperator(const OperatorSpec& spec) : grid_{0, {1, 1, 1},
                     "Stencil: coefficients must have shape (batch or 1, k, *shape) with 1 to 3 axes in shape, got ",
                     sizes);
   TORCH_CHECK_TYPE(coefficients_.scalar_type() == at::kFloat || coefficients_.scalar_type() == at::kDouble,
-                   "Stencil: coefficients must be float32 or float64, got ", coefficients_.scalar_type());
+                   "Stencil: coefficients must be float32 or float64, got ", dtype_name(coefficients_.scalar_type()));
   const at::ArrayRef<double> p = spec.parameters;
   const auto axes = static_cast<size_t>(dim());
   TORCH_CHECK_VALUE(p.size() >= axes && p.size() % axes == 0, "Stencil: every offset must have ", dim(), " entries");

@@ -6,6 +6,7 @@
 #include <limits>
 #include <sstream>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 
@@ -27,7 +28,8 @@ StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t
                     ": nu must be a number, a 0-dimensional tensor, or (batch,), one for each "
                     "sample, got shape ",
                     nu.sizes());
-  TORCH_CHECK_TYPE(at::isFloatingType(nu.scalar_type()), owner, ": nu must be a real number, got ", nu.scalar_type());
+  TORCH_CHECK_TYPE(at::isFloatingType(nu.scalar_type()), owner, ": nu must be a real number, got ",
+                   dtype_name(nu.scalar_type()));
 }
 
 namespace {

@@ -6,6 +6,8 @@
 #include <tuple>
 #include <vector>
 
+#include "prdp/error_text.h"
+
 /// What batches of tensors need everywhere.
 namespace prdp {
 
@@ -93,8 +95,8 @@ inline at::Tensor padded(const at::Tensor& t, int64_t axis, int64_t before, int6
 inline void check_goes_with(const at::Tensor& given, const at::Tensor& vector, const char* owner, const char* name) {
   TORCH_CHECK_VALUE(given.sym_size(0) == 1 || given.sym_size(0) == vector.sym_size(0), owner, ": ", name, " hold ",
                     given.sym_size(0), " samples, the vector holds ", vector.sym_size(0));
-  TORCH_CHECK_TYPE(vector.scalar_type() == given.scalar_type(), owner, ": ", name, " are ", given.scalar_type(),
-                   " but the vector is ", vector.scalar_type());
+  TORCH_CHECK_TYPE(vector.scalar_type() == given.scalar_type(), owner, ": ", name, " are ",
+                   dtype_name(given.scalar_type()), " but the vector is ", dtype_name(vector.scalar_type()));
   TORCH_CHECK_VALUE(vector.device() == given.device(), owner, ": ", name, " are on ", given.device(),
                     " but the vector is on ", vector.device());
 }

@@ -231,6 +231,18 @@ std::string failure_text(const Report& report, const std::vector<int64_t>& faile
   return text.str();
 }
 
+/// A preconditioner is M⁻¹ here, and M in some other libraries.
+void warn_of_another_convention(const SolveRole& role, const Operator& a, const at::Tensor& b) {
+  const auto& preconditioner = role.solver.preconditioner;
+  if (role.adjoint || !preconditioner.is_operator() || !b.is_cpu() || b.numel() == 0) return;
+  const auto key = c10::str("convention", name(role.solver.method), preconditioner.spec().kind, role.a.kind, b.sizes());
+  if (!should_look(std::hash<std::string>()(key)) || !preconditions_with_operator({role, a, b, 0})) return;
+  warn_once(key, 0.0, [](std::ostream& text) {
+    text << "linear_solve: the preconditioner resembles A; it should resemble the inverse of A, as it is applied as "
+            "M⁻¹";
+  });
+}
+
 bool was_warned_of(FunctionCode& code) {
   return code.warned_of_product.exchange(true) && !c10::WarningUtils::get_warnAlways();
 }
@@ -241,6 +253,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
                      OnFailure on_failure) {
   if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad)
     return look_for_lost_cotangents(role, info);
+  warn_of_another_convention(role, a, b);
   const auto on_host = info.status.to(at::kCPU);
   const auto* first = on_host.const_data_ptr<int64_t>();
   const auto is_told = [&](int64_t s) {  // MAX_ITER without a tolerance is what was asked for

@@ -52,7 +52,7 @@ void TensorSpace::define_scale(const Vector& product, const Vector& v, at::Tenso
 void TensorSpace::check_scale(const at::Tensor& scale) const {
   const auto exponent = scale.detach().log2().abs().amax().item<double>();
   const double most = b_.scalar_type() == at::kFloat ? 60.0 : 500.0;
-  TORCH_CHECK_VALUE(exponent <= most, "linear_solve: unrolled in ", b_.scalar_type(),
+  TORCH_CHECK_VALUE(exponent <= most, "linear_solve: unrolled in ", dtype_name(b_.scalar_type()),
                     ", A may change the size of a vector by a factor of 2^", most, ", got 2^", exponent,
                     "; scale A and b, or take ", in_language("backward=\"implicit\"", "Backward::kImplicit"));
 }

@@ -81,4 +81,19 @@ std::string unfit(const FailedSample& sample) {
          " ‖M⁻¹v‖ for a v of no structure); take GMRES";
 }
 
+bool preconditions_with_operator(const FailedSample& sample) {
+  const at::NoGradGuard no_grad;
+  const auto m = make_operator(sample.preconditioner().spec());
+  const auto v = unstructured_like(sample.b);
+  const auto direction = [&](const at::Tensor& of) {
+    const auto all = row(of, sample.index);
+    return all / norm_of(all);
+  };
+  const auto by_a = direction(sample.a.apply(v));
+  const auto off = [&](const at::Tensor& of) { return 1.0 - std::abs(by_a.dot(direction(of)).item<double>()); };
+  constexpr double little = 0.01;  // where A nearly is a multiple of the identity, so is its inverse
+  const double of_identity = off(v);
+  return of_identity > little && off(m->apply(v)) < 0.5 * of_identity;
+}
+
 }  // namespace prdp

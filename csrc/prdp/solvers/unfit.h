@@ -16,4 +16,7 @@ std::string asymmetric(const FailedSample& sample);
 /// not: that, in words. Else empty.
 std::string unfit(const FailedSample& sample);
 
+/// Whether a preconditioner of one's own resembles A, where it should resemble its inverse.
+bool preconditions_with_operator(const FailedSample& sample);
+
 }  // namespace prdp

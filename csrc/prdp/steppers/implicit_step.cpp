@@ -1,6 +1,7 @@
 #include "prdp/steppers/implicit_step.h"
 
 #include "prdp/autograd/detach_failed.h"
+#include "prdp/error_text.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/rollout_loops.h"
 
@@ -36,8 +37,8 @@ SolveResult ImplicitStep::solve_from(const at::Tensor& u, int64_t adjoint_log) c
   const auto b = rhs(u);
   TORCH_CHECK_VALUE(b.defined(), who_, ": rhs returned an undefined tensor");
   TORCH_CHECK_VALUE(b.sizes() == u.sizes() && b.scalar_type() == u.scalar_type(), who_,
-                    ": rhs must return the shape and dtype of the state, ", u.sizes(), " in ", u.scalar_type(),
-                    ", got ", b.sizes(), " in ", b.scalar_type());
+                    ": rhs must return the shape and dtype of the state, ", u.sizes(), " in ",
+                    dtype_name(u.scalar_type()), ", got ", b.sizes(), " in ", dtype_name(b.scalar_type()));
   auto options = options_;
   options.adjoint_log = adjoint_log;
   return linear_solve(a, b, options, start_of_step(options, u));

@@ -4,6 +4,8 @@
 
 #include <cmath>
 
+#include "prdp/error_text.h"
+
 namespace prdp {
 
 namespace {
@@ -37,7 +39,8 @@ const at::Tensor& Saved::take(const std::string& name, at::ScalarType dtype, at:
   const auto& tensor = found(name);
   asked_.insert(name);
   TORCH_CHECK_VALUE(tensor.scalar_type() == dtype && tensor.sizes() == sizes, "tensor '", name, "' is ",
-                    tensor.scalar_type(), " of sizes ", tensor.sizes(), ", expected ", dtype, " of sizes ", sizes);
+                    dtype_name(tensor.scalar_type()), " of sizes ", tensor.sizes(), ", expected ", dtype_name(dtype),
+                    " of sizes ", sizes);
   check_values(name, tensor, range);
   return tensor;
 }

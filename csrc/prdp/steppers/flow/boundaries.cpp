@@ -240,7 +240,8 @@ FlowFields of_samples(const std::vector<FlowFields>& boxes) {
 
 void check_obstacle(const at::Tensor& obstacle, at::IntArrayRef shape) {
   TORCH_CHECK_TYPE(obstacle.scalar_type() == at::kBool,
-                   "Flow: obstacle must be a bool tensor, true in solid cells, got ", obstacle.scalar_type());
+                   "Flow: obstacle must be a bool tensor, true in solid cells, got ",
+                   dtype_name(obstacle.scalar_type()));
   const auto sizes = obstacle.sizes();
   const bool fits = sizes == shape || (sizes.size() == shape.size() + 1 && sizes.slice(1) == shape);
   TORCH_CHECK_VALUE(fits, "Flow: obstacle must have the shape of the grid, ", shape, ", or (batch or 1) of them, got ",

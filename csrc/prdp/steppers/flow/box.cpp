@@ -6,6 +6,7 @@
 #include <cmath>
 #include <limits>
 
+#include "prdp/error_text.h"
 #include "prdp/grid/grid.h"
 #include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/steppers/flow/boundaries.h"
@@ -123,7 +124,8 @@ void FlowBox::check_velocity(const at::Tensor& u) const {
   TORCH_CHECK_VALUE(samples_ == 1 || samples_ == u.size(0), "Flow: obstacle holds ", samples_, " samples, u holds ",
                     u.size(0));
   TORCH_CHECK_TYPE(u.scalar_type() == at::kFloat || u.scalar_type() == at::kDouble,
-                   "Flow: u must be float32 or float64, got ", u.scalar_type(), hint_of_dtype(u.scalar_type()));
+                   "Flow: u must be float32 or float64, got ", dtype_name(u.scalar_type()),
+                   hint_of_dtype(u.scalar_type()));
 }
 
 const FlowFields& FlowBox::fields(const at::TensorOptions& options) const {

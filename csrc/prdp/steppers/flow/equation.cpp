@@ -20,7 +20,7 @@ namespace {
 void check_field(const char* name, const at::Tensor& t, std::vector<int64_t> of_sample) {
   const int64_t d = of_sample[0];
   TORCH_CHECK_TYPE(at::isFloatingType(t.scalar_type()), "Flow: ", name, " must hold real numbers, got ",
-                   t.scalar_type());
+                   dtype_name(t.scalar_type()));
   const bool uniform = t.dim() == 1 && t.size(0) == d;
   const bool field =
       t.dim() == static_cast<int64_t>(of_sample.size()) + 1 && t.sizes().slice(1) == at::IntArrayRef(of_sample);
@@ -73,7 +73,7 @@ at::Tensor with_all_axes(at::Tensor t, const at::Tensor& u, int64_t place = 1) {
 
 /// Returns the largest nu. Raises ValueError for one that is out of range, TypeError for one that is complex.
 double check_nu(const FlowEquation& e) {
-  TORCH_CHECK_TYPE(!e.nu.is_complex(), "Flow: nu must be real, got ", e.nu.scalar_type());
+  TORCH_CHECK_TYPE(!e.nu.is_complex(), "Flow: nu must be real, got ", dtype_name(e.nu.scalar_type()));
   TORCH_CHECK_VALUE(e.nu.dim() <= 1, "Flow: nu must be a number, or a tensor of shape () or (batch or 1,), got ",
                     e.nu.sizes());
   const auto values = e.nu_values();
