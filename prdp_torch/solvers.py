@@ -258,7 +258,7 @@ class Multigrid(Solver):
 @dataclass
 class Direct(Solver):
     """The cheapest exact method of the operator: Thomas' algorithm in 1D; sine transforms, FFT or products along the
-    axes for constant coefficients in a box; else LU or Cholesky, sparse or dense. It takes no preconditioner.
+    axes for constant coefficients in a box; else LU or Cholesky, banded, sparse or dense. It takes no preconditioner.
 
     Args:
         max_iter: 1 by default. An iteration is one direct solve; those after the first refine its result.

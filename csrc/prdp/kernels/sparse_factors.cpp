@@ -7,6 +7,7 @@
 #include <limits>
 #include <numeric>
 
+#include "prdp/kernels/band_factors.h"
 #include "prdp/kernels/cholesky_solve.h"
 #include "prdp/kernels/equilibration.h"
 #include "prdp/kernels/flush_subnormals.h"
@@ -17,6 +18,9 @@ namespace prdp::kernels {
 namespace {
 
 using Matrix = SparseFactors::Matrix;
+
+/// The least share of its column or row that a pivot of n unknowns is not rounding.
+double rounding_of(Eigen::Index n) { return std::numeric_limits<double>::epsilon() * static_cast<double>(n); }
 
 /// LU that tells its pivots.
 class PivotedLU : public Eigen::SparseLU<Matrix> {
@@ -119,7 +123,7 @@ struct SparseFactors::Factorised {
       if (m.rows() > 0 && m.coeff(0, 0) < 0.0) sign = -1.0;
       cholesky.emplace(Matrix(sign * m));
       if (cholesky->info() == Eigen::Success) {
-        is_regular = pivots_exceed(rounding_of(m), *cholesky);
+        is_regular = pivots_exceed(rounding_of(m.rows()), *cholesky);
         return;
       }
       cholesky.reset();
@@ -137,15 +141,12 @@ struct SparseFactors::Factorised {
   }
 
  private:
-  static double rounding_of(const Matrix& m) {
-    return std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows());
-  }
   void factor(const Matrix& m) {
     Eigen::VectorXd sums = Eigen::VectorXd::Zero(m.cols());
     for (Eigen::Index j = 0; j < m.outerSize(); ++j)
       for (Matrix::InnerIterator it(m, j); it; ++it) sums[j] += std::abs(it.value());
     lu.compute(m);
-    is_regular = lu.info() == Eigen::Success && lu.pivots_exceed(rounding_of(m), sums);
+    is_regular = lu.info() == Eigen::Success && lu.pivots_exceed(rounding_of(m.rows()), sums);
   }
 };
 
@@ -156,6 +157,8 @@ SparseFactors::SparseFactors(const Triplets& entries, int64_t n, const Pins& pin
   for (const auto& e : entries)  // zeros, such as those between the columns of a field, would fill in
     if (e.value() != 0.0 && kept_equations_[e.row()] >= 0 && kept_unknowns_[e.col()] >= 0)
       kept.emplace_back(kept_equations_[e.row()], kept_unknowns_[e.col()], e.value());
+  band_ = BandFactors::make(kept, size, rounding_of(size));
+  if (band_) return;
   auto m = std::make_shared<Matrix>(size, size);
   m->setFromTriplets(kept.begin(), kept.end());
   factorised_ = interruption::in_a_thread_to_leave(entries.size() > 100'000,
@@ -164,16 +167,16 @@ SparseFactors::SparseFactors(const Triplets& entries, int64_t n, const Pins& pin
 
 SparseFactors::~SparseFactors() = default;
 
-bool SparseFactors::is_regular() const { return factorised_->is_regular; }
+bool SparseFactors::is_regular() const { return band_ || factorised_->is_regular; }
 
-bool SparseFactors::gains_by_several() const { return factorised_->cholesky.has_value(); }
+bool SparseFactors::gains_by_several() const { return band_ || factorised_->cholesky; }
 
 void SparseFactors::solve(Eigen::Ref<Eigen::MatrixXd> x, bool transposed) const {
   const FlushSubnormals flush;
   const auto& to_take = transposed ? kept_unknowns_ : kept_equations_;
   const auto& to_give = transposed ? kept_equations_ : kept_unknowns_;
-  if (factorised_->cholesky) {
-    solve_by_cholesky<8>(x, to_take, to_give);
+  if (gains_by_several()) {
+    solve_side_by_side<8>(x, to_take, to_give, transposed);
     return;
   }
   const auto& scales = factorised_->scales;
@@ -191,34 +194,37 @@ void SparseFactors::solve(Eigen::Ref<Eigen::MatrixXd> x, bool transposed) const 
 }
 
 template <int Count>
-void SparseFactors::solve_by_cholesky(Eigen::Ref<Eigen::MatrixXd> x, const Eigen::VectorXi& to_take,
-                                      const Eigen::VectorXi& to_give) const {
+void SparseFactors::solve_side_by_side(Eigen::Ref<Eigen::MatrixXd> x, const Eigen::VectorXi& to_take,
+                                       const Eigen::VectorXi& to_give, bool transposed) const {
   Eigen::Index column = 0;
-  for (; column + Count <= x.cols(); column += Count) {
-    solve_block<Count>(x.middleCols<Count>(column), to_take, to_give);
-  }
-  if constexpr (Count > 1) solve_by_cholesky<Count / 2>(x.rightCols(x.cols() - column), to_take, to_give);
+  for (; column + Count <= x.cols(); column += Count)
+    solve_block<Count>(x.middleCols<Count>(column), to_take, to_give, transposed);
+  if constexpr (Count > 1) solve_side_by_side<Count / 2>(x.rightCols(x.cols() - column), to_take, to_give, transposed);
 }
 
 template <int Count>
-void SparseFactors::solve_block(Block<Count> x, const Eigen::VectorXi& to_take, const Eigen::VectorXi& to_give) const {
-  const auto& cholesky = *factorised_->cholesky;
-  const auto& place = cholesky.permutationP().indices();
-  std::vector<double> side_by_side(place.size() * Count);
+void SparseFactors::solve_block(Block<Count> x, const Eigen::VectorXi& to_take, const Eigen::VectorXi& to_give,
+                                bool transposed) const {
+  const auto* const cholesky = band_ ? nullptr : &*factorised_->cholesky;
+  const double sign = band_ ? 1.0 : factorised_->sign;
+  const auto place = [&](int64_t i) { return band_ ? band_->place(i) : cholesky->permutationP().indices()[i]; };
+  std::vector<double> side_by_side((band_ ? band_->length() : cholesky->rows()) * Count);
   double* const memory = side_by_side.data();
   for (int64_t i = 0; i < x.rows(); ++i) {
     if (to_take[i] < 0) continue;
-    double* const to = memory + int64_t{place[to_take[i]]} * Count;
+    double* const to = memory + place(to_take[i]) * Count;
     for (int c = 0; c < Count; ++c) to[c] = x(i, c);
   }
-  solve_cholesky<Count>(cholesky.matrixL().nestedExpression(), memory);
+  if (band_) band_->solve<Count>(memory, transposed);
+  else solve_cholesky<Count>(cholesky->matrixL().nestedExpression(), memory);
   for (int64_t i = 0; i < x.rows(); ++i) {
-    const double* const from = to_give[i] >= 0 ? memory + int64_t{place[to_give[i]]} * Count : nullptr;
-    for (int c = 0; c < Count; ++c) x(i, c) = from ? factorised_->sign * from[c] : 0.0;
+    const double* const from = to_give[i] >= 0 ? memory + place(to_give[i]) * Count : nullptr;
+    for (int c = 0; c < Count; ++c) x(i, c) = from ? sign * from[c] : 0.0;
   }
 }
 
 int64_t SparseFactors::bytes() const {
+  if (band_) return band_->bytes() + kept_unknowns_.size() * 8;
   const int64_t stored = factorised_->cholesky ? factorised_->cholesky->matrixL().nestedExpression().nonZeros()
                          : is_regular()        ? int64_t{factorised_->lu.nnzL()} + factorised_->lu.nnzU()
                                                : 0;

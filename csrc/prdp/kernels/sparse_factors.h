@@ -5,6 +5,7 @@
 #include <optional>
 #include <vector>
 
+#include "prdp/kernels/band_factors.h"
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/null_space.h"
 
@@ -31,9 +32,9 @@ Pins pins_of(const std::optional<NullSpace<T>>& right, const std::optional<NullS
   return pins;
 }
 
-/// Factors of a sparse matrix in double by Eigen: Cholesky's if the matrix is symmetric and definite of either sign,
-/// which takes a quarter of the time, otherwise LU with pivoting. Any thread may solve with them. Pivots are judged
-/// beside their own rows or columns, whose sizes may differ by any factor.
+/// Factors of a sparse matrix in double: of its band if that is narrow, else by Eigen: Cholesky's if the matrix is
+/// symmetric and definite of either sign, which takes a quarter of the time, otherwise LU with pivoting. Any thread may
+/// solve with them. Pivots are judged beside their own rows or columns, whose sizes may differ by any factor.
 class SparseFactors {
  public:
   using Matrix = Eigen::SparseMatrix<double>;
@@ -54,12 +55,14 @@ class SparseFactors {
   using Block = Eigen::Ref<Eigen::Matrix<double, Eigen::Dynamic, Count>>;
   /// In blocks of Count columns, and then of fewer.
   template <int Count>
-  void solve_by_cholesky(Eigen::Ref<Eigen::MatrixXd> x, const Eigen::VectorXi& to_take,
-                         const Eigen::VectorXi& to_give) const;
+  void solve_side_by_side(Eigen::Ref<Eigen::MatrixXd> x, const Eigen::VectorXi& to_take, const Eigen::VectorXi& to_give,
+                          bool transposed) const;
   template <int Count>
-  void solve_block(Block<Count> x, const Eigen::VectorXi& to_take, const Eigen::VectorXi& to_give) const;
+  void solve_block(Block<Count> x, const Eigen::VectorXi& to_take, const Eigen::VectorXi& to_give,
+                   bool transposed) const;
   Eigen::VectorXi kept_unknowns_, kept_equations_;
-  std::shared_ptr<const Factorised> factorised_;
+  std::optional<BandFactors> band_;
+  std::shared_ptr<const Factorised> factorised_;  // without a band
 };
 
 /// Those of a kernel, from the cache or made: kernel.for_each_entry(body), key() and transposed() tell the matrix. The
