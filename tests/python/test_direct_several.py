@@ -40,10 +40,29 @@ def diffusion(channels, **settings):
     return make
 
 
+def dense(n):
+    def make(dtype):
+        return operators.Matrix((random(n, n, seed=7) + n / 4 * torch.eye(n, dtype=F64)).to(dtype)), (n,)
+
+    return make
+
+
+def beam(boundary):
+    def make(dtype):
+        rows = torch.tensor([7.0, -4.0, -4.0, 1.0, 1.0], dtype=F64).view(1, 5, 1) + 0.1 * random(1, 5, 31)
+        return operators.Stencil(rows.to(dtype), [(0,), (-1,), (1,), (-2,), (2,)], boundary), (2, 31)
+
+    return make
+
+
 CASES = {
     "csr": csr(),
     "negative csr": csr(sign=-1),
     "unsymmetric csr": csr(above=1),
+    "dense": dense(23),
+    "large dense": dense(203),
+    "beam": beam("zero"),
+    "ring of beams": beam("periodic"),
     "diffusion": diffusion(2, shift=0.1),
     "closed diffusion": diffusion(3, boundary="flux"),
 }

@@ -4,6 +4,8 @@
 #include <optional>
 #include <vector>
 
+#include "prdp/kernels/add_product_once.h"
+
 namespace prdp::kernels {
 
 /// LU with partial pivoting of a matrix whose entries lie near the diagonal, as those of one dimension do: there is no
@@ -44,7 +46,7 @@ class BandFactors {
 
   template <int Count>
   static void take_off(double factor, const double* of, double* from) {
-    for (int c = 0; c < Count; ++c) from[c] -= factor * of[c];
+    for (int c = 0; c < Count; ++c) from[c] = add_product_once(from[c], -factor, of[c]);
   }
   template <int Count>
   void swap_rows(double* x, int64_t j) const {

@@ -29,6 +29,8 @@ class Factors {
     for (int64_t i = 0; i < count; ++i) found &= solve(r[i], d[i]);
     return found;
   }
+  /// Whether A x is at hand, as x is a solution that was found among several; if so, stores it.
+  virtual bool has_product(const T* /*x*/, T* /*out*/) const { return false; }
 };
 
 /// factor()·A on one channel of one sample, as a stencil on a grid.
@@ -72,7 +74,10 @@ class Kernel {
   virtual int64_t work() const { return unknowns(); }
   /// out = A v
   virtual void apply(const T* v, T* out) const = 0;
-  /// The same; returns v·out and ‖out‖².
+  /// The same for several vectors, with the bits that each has alone; false if that takes as long as one after the
+  /// other.
+  virtual bool apply_to_several(const T* const* /*v*/, T* const* /*out*/, int64_t /*count*/) const { return false; }
+  /// As apply(); returns v·out and ‖out‖².
   virtual std::array<T, 2> apply_with_dots(const T* v, T* out) const {
     apply(v, out);
     return {vectors_.dot(v, out, length()), vectors_.dot(out, out, length())};

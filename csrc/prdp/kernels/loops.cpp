@@ -56,6 +56,7 @@ constexpr Loops<T> table(const char* level) {
           .multiply = multiply<T>,
           .add_rows = add_rows<T>,
           .factor_lu = factor_lu,
+          .solve_lu = {solve_lu<1>, solve_lu<2>, solve_lu<4>, solve_lu<8>},
           .advect_row = advect_row<T>,
           .advect_row_back = advect_row_back<T>};
 }

@@ -184,6 +184,9 @@ struct Loops {
   /// P A = L U with partial pivoting, in the place of A, whose n columns begin `stride` apart. L has ones on its
   /// diagonal. Row i of P A is row rows[i] of A.
   void (*factor_lu)(double* a, int64_t stride, int64_t n, int64_t* rows);
+  /// x ← U⁻¹ L⁻¹ x, or L⁻ᵀ U⁻ᵀ x, of 1, 2, 4 or 8 vectors (the power of two is the index) whose entries lie side by
+  /// side: each has the bits that it has alone.
+  void (*solve_lu[4])(const double* lu, int64_t stride, int64_t n, double* x, bool transposed);
 
   /// out += the term, for a row of any n.
   void (*advect_row)(const AdvectionTerm<T>& t, const T* c, const T* w, T* out, int64_t n);

@@ -76,17 +76,11 @@ class Dense final : public MatrixKernel<T> {
   /// The matrix that is not transposed.
   const T* values() const { return a_; }
   bool transposed() const { return transposed_; }
-  void apply(const T* v, T* out) const override {
-    if (!transposed_) {
-      return this->for_each_part(work(), 1, [&](int64_t begin, int64_t end) {
-        for (int64_t i = begin; i < end; ++i) out[i] = loops_.dot(a_ + i * n(), v, n());
-      });
-    }
-    constexpr int64_t least = 128;  // columns, so that pieces of rows fill whole cache lines
-    this->for_each_part(work(), least, [&](int64_t begin, int64_t end) {
-      std::fill(out + begin, out + end, T(0));
-      loops_.add_rows(v, a_ + begin, n(), n(), out + begin, end - begin);
-    });
+  void apply(const T* v, T* out) const override { multiply(&v, &out, 1, n()); }
+  bool apply_to_several(const T* const* v, T* const* out, int64_t count) const override {
+    constexpr int64_t columns = 64;  // at once, so that the cache holds them for all vectors
+    multiply(v, out, count, columns);
+    return true;
   }
   double norm() const override {
     std::vector<double> sums(n(), 0.0);  // of the rows of the matrix as applied
@@ -102,6 +96,27 @@ class Dense final : public MatrixKernel<T> {
 
  private:
   using MatrixKernel<T>::n;
+
+  /// `columns`: of the matrix, at once, where its transpose is applied.
+  void multiply(const T* const* v, T* const* out, int64_t count, int64_t columns) const {
+    if (!transposed_) {
+      return this->for_each_part(work(), 1, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i)
+          for (int64_t k = 0; k < count; ++k) out[k][i] = loops_.dot(a_ + i * n(), v[k], n());
+      });
+    }
+    constexpr int64_t least = 128;  // columns, so that pieces of rows fill whole cache lines
+    this->for_each_part(work(), least, [&](int64_t begin, int64_t end) {
+      for (; begin < end; begin += columns) {
+        const int64_t size = std::min(columns, end - begin);
+        for (int64_t k = 0; k < count; ++k) {
+          std::fill_n(out[k] + begin, size, T(0));
+          loops_.add_rows(v[k], a_ + begin, n(), n(), out[k] + begin, size);
+        }
+      }
+    });
+  }
+
   const Loops<T>& loops_ = loops<T>();
   const T* a_;
   bool transposed_;

@@ -13,6 +13,21 @@ namespace {
 template <class T>
 using Values = Eigen::Matrix<T, Eigen::Dynamic, 1>;
 
+/// d_i = A⁻¹ r_i, or A⁻ᵀ r_i, by these factors; false if one is not finite.
+template <class T, class F>
+bool solve_columns(const F& factors, const T* const* r, T* const* d, int64_t count, int64_t n, bool transposed) {
+  Eigen::MatrixXd x(n, count);
+  for (int64_t i = 0; i < count; ++i) x.col(i) = Eigen::Map<const Values<T>>(r[i], n).template cast<double>();
+  factors.solve(x, transposed);
+  bool finite = true;
+  for (int64_t i = 0; i < count; ++i) {
+    Eigen::Map<Values<T>> found(d[i], n);
+    found = x.col(i).template cast<T>();
+    finite &= found.allFinite();
+  }
+  return finite;
+}
+
 /// LU with partial pivoting, in double whatever the dtype of the matrix. Where that finds no regular matrix, the rows
 /// and columns may only differ much in size: they are scaled, and factored again.
 class DenseLU {
@@ -29,16 +44,17 @@ class DenseLU {
     scales_ = scales;
   }
   bool is_regular() const { return is_regular_; }
-  /// A⁻¹ b, or A⁻ᵀ b
-  Eigen::VectorXd solve(const Eigen::VectorXd& b, bool transposed) const {
-    if (!scales_) return solve_factors(b, transposed);
-    const auto &before = transposed ? scales_->columns : scales_->rows,
-               &behind = transposed ? scales_->rows : scales_->columns;
-    return behind.cwiseProduct(solve_factors(before.cwiseProduct(b), transposed));
+  /// x ← A⁻¹ x, or A⁻ᵀ x, for each column.
+  void solve(Eigen::Ref<Eigen::MatrixXd> x, bool transposed) const {
+    for (Eigen::Index column = 0, power = 3; column < x.cols(); column += Eigen::Index{1} << power) {
+      while (column + (Eigen::Index{1} << power) > x.cols()) --power;
+      solve_block(x.middleCols(column, Eigen::Index{1} << power), power, transposed);
+    }
   }
   int64_t bytes() const { return memory_.size() * static_cast<int64_t>(sizeof(double)); }
 
  private:
+  using SideBySide = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
   /// A pivot is rounding beside its own column: how large the others are does not matter.
   void factor(const Eigen::MatrixXd& m) {
     const int64_t n = m.rows();
@@ -49,21 +65,14 @@ class DenseLU {
     loops<double>().factor_lu(memory_.data(), memory_.rows(), n, rows_.data());
     is_regular_ = (memory_.diagonal().cwiseAbs().array() > rounding * sizes).all();
   }
-  Eigen::VectorXd solve_factors(const Eigen::VectorXd& b, bool transposed) const {
-    const auto lu = memory_.topRows(memory_.cols());
-    const auto lower = lu.triangularView<Eigen::UnitLower>();
-    const auto upper = lu.triangularView<Eigen::Upper>();
-    Eigen::VectorXd x = transposed ? b : b(rows_);
-    if (!transposed) {
-      lower.solveInPlace(x);
-      upper.solveInPlace(x);
-      return x;
-    }
-    upper.transpose().solveInPlace(x);
-    lower.transpose().solveInPlace(x);
-    Eigen::VectorXd y(x.size());
-    y(rows_) = x;
-    return y;
+  /// Of 2^power columns.
+  void solve_block(Eigen::Ref<Eigen::MatrixXd> x, Eigen::Index power, bool transposed) const {
+    if (scales_) x.array().colwise() *= (transposed ? scales_->columns : scales_->rows).array();
+    SideBySide side_by_side = transposed ? SideBySide(x) : SideBySide(x(rows_, Eigen::all));
+    loops<double>().solve_lu[power](memory_.data(), memory_.rows(), x.rows(), side_by_side.data(), transposed);
+    if (transposed) x(rows_, Eigen::all) = side_by_side;
+    else x = side_by_side;
+    if (scales_) x.array().colwise() *= (transposed ? scales_->rows : scales_->columns).array();
   }
 
   Eigen::MatrixXd memory_;  // L and U, with rows below them where columns would else compete for places in the cache
@@ -90,11 +99,10 @@ class DenseFactors final : public Factors<T> {
     if (a.null_space() || n_ < worth_keeping) lu_ = make();
     else lu_ = factor_cache::find_or_make<DenseLU>(FactorKeyMaker().add(n_).add(a.values(), n_ * n_).key(), make);
   }
-  bool solve(const T* r, T* d) const override {
-    if (!lu_->is_regular()) return false;
-    const Eigen::VectorXd x = lu_->solve(Eigen::Map<const Values<T>>(r, n_).template cast<double>(), transposed_);
-    Eigen::Map<Values<T>>(d, n_) = x.template cast<T>();
-    return x.template cast<T>().allFinite();
+  bool gains_by_several() const override { return true; }
+  bool solve(const T* r, T* d) const override { return solve_several(&r, &d, 1); }
+  bool solve_several(const T* const* r, T* const* d, int64_t count) const override {
+    return lu_->is_regular() && solve_columns<T>(*lu_, r, d, count, n_, transposed_);
   }
 
  private:
@@ -118,17 +126,7 @@ class CsrFactors final : public Factors<T> {
   bool gains_by_several() const override { return sparse_->gains_by_several(); }
   bool solve(const T* r, T* d) const override { return solve_several(&r, &d, 1); }
   bool solve_several(const T* const* r, T* const* d, int64_t count) const override {
-    if (!sparse_->is_regular()) return false;
-    Eigen::MatrixXd x(n_, count);
-    for (int64_t i = 0; i < count; ++i) x.col(i) = Eigen::Map<const Values<T>>(r[i], n_).template cast<double>();
-    sparse_->solve(x, transposed_);
-    bool finite = true;
-    for (int64_t i = 0; i < count; ++i) {
-      Eigen::Map<Values<T>> found(d[i], n_);
-      found = x.col(i).template cast<T>();
-      finite &= found.allFinite();
-    }
-    return finite;
+    return sparse_->is_regular() && solve_columns<T>(*sparse_, r, d, count, n_, transposed_);
   }
 
  private:

@@ -111,7 +111,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   }
   void apply(const T* v, Vector out) {
     count(1);
-    system_.a().apply(v, out);
+    system_.apply(v, out);
     if (system_.a().needs_projection()) project(out);
   }
   void keep_in_range(Vector v) {

@@ -25,6 +25,10 @@ class SampleSystem {
   }
 
   const kernels::Kernel<T>& a() const { return *a_; }
+  /// out = A v
+  void apply(const T* v, T* out) const {
+    if (!factors_ || !factors_->has_product(v, out)) a_->apply(v, out);
+  }
   /// Null: none.
   kernels::Preconditioner<T>* preconditioner() const { return preconditioner_.get(); }
   /// Whether M is the diagonal of A.
