@@ -273,3 +273,28 @@ def test_channels_of_equal_size_are_not_called_small(rtol, always):
         b = torch.randn(1, 2, 16, 16, dtype=F64, generator=torch.Generator().manual_seed(seed))
         _, said = warnings_of(lambda b=b: prdp.linear_solve(a, b, prdp.CG(500, rtol=rtol)))
         assert not said, (seed, said)
+
+
+def test_in_float32_the_rtol_that_is_named_ends_in_the_rounding_of_each_row(always):
+    """Confidences of pixels over eight decades: the residual is rounding, and u is right nonetheless."""
+    n, generator = 96, torch.Generator().manual_seed(0)
+    confidence = (3 * torch.randn(1, n, n, generator=generator, dtype=F64)).exp()
+    confidence *= torch.rand(1, n, n, generator=generator) < 0.05
+    image = torch.rand(1, 1, n, n, generator=generator, dtype=F64)
+    a = operators.Diffusion(torch.ones(1, n, n), shift=confidence.float(), boundary="flux", length=float(n))
+    b = (confidence * image).float()
+    exact, _ = prdp.linear_solve(
+        operators.Diffusion(torch.ones(1, n, n, dtype=F64), shift=confidence, boundary="flux", length=float(n)),
+        confidence * image,
+        prdp.Direct(),
+    )
+    solver = prdp.CG(2000, preconditioner="diagonal")
+    (u, _), (text,) = warnings_of(lambda: prdp.linear_solve(a, b, solver))
+    assert (u - exact).abs().max() > 1e-3 * exact.abs().max()
+    rtol, end = text.split("rtol, such as ")[1].split("; ")
+    assert end.startswith("in float32 that ends STAGNATED, at the rounding of each row")
+    (u, info), said = warnings_of(
+        lambda: prdp.linear_solve(a, b, prdp.CG(2000, float(rtol), preconditioner="diagonal"))
+    )
+    assert info.status.item() == prdp.SolveStatus.STAGNATED and not said
+    assert (u - exact).abs().max() < 1e-4 * exact.abs().max()
