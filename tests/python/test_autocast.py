@@ -194,7 +194,7 @@ ENTRIES = {
     "linear_solve, x0": (lambda b, x: report(prdp.linear_solve(operators.Heat(SHAPE, 1e-2, 0.1), b, prdp.CG(3), x0=x)),
                          [SCALAR, SCALAR]),
     "linear_solve, a lone vector": (lambda v, b: report(prdp.linear_solve(csr(v), b, prdp.Direct())), [(N,), (N,)]),
-    "preconditioner": (lambda v, b: report(prdp.linear_solve(csr(v), b, prdp.CG(3, preconditioner=csr(v)))),
+    "preconditioner": (lambda v, b: report(prdp.linear_solve(csr(v), b, prdp.CG(3, preconditioner=csr(1 / v)))),
                        [(N,), VECTOR]),
     "multigrid": (lambda c, b: report(prdp.linear_solve(stencil(c), b, prdp.CG(9, preconditioner="multigrid"))),
                   [(2, 5, *SHAPE), SCALAR]),

@@ -298,3 +298,18 @@ def test_in_float32_the_rtol_that_is_named_ends_in_the_rounding_of_each_row(alwa
     )
     assert info.status.item() == prdp.SolveStatus.STAGNATED and not said
     assert (u - exact).abs().max() < 1e-4 * exact.abs().max()
+
+
+def test_the_worst_of_the_samples_is_named_and_the_others_are_counted(always):
+    """u that is far too large is measured by what it should be."""
+    pair = torch.tensor([[1.0, -1.0], [-1.0, 1.0]], dtype=F64)
+    weak = torch.tensor([1e1, 1e-8, 1e-6], dtype=F64).view(3, 1, 1) * torch.eye(2, dtype=F64)
+    a = torch.zeros(3, 3, 3, dtype=F64)
+    a[:, :2, :2], a[:, 2, 2] = pair + weak, 1e4
+    b = torch.tensor([[1.0, -1.0 + 1e-3, 1e4]], dtype=F64).expand(3, 3)
+    exact = torch.linalg.solve(a, b)
+    (u, info), said = warnings_of(lambda: prdp.linear_solve(a, b, prdp.CG(100, rtol=1e-4)))
+    off = (u - exact).abs().amax(1) / exact.abs().amax(1)
+    assert info.solved.all() and off.argmax() == 1 and (off > 1e-2).sum() == 2
+    (text,) = said
+    assert "sample 1 CONVERGED" in text and "(and those of 1 other sample" in text

@@ -60,7 +60,7 @@ std::vector<std::pair<const char*, at::Tensor>> DiffusionOperator::tensors() con
 std::string DiffusionOperator::remedy_for(const at::Tensor& b) const {
   if (per_axis_ || dim() != b.dim() - 1) return "";
   if (shape_[0] == 1) return "; kappa has no channel axis: take kappa[:, 0]";
-  return shape_[0] == dim() - 1 ? "; with per_axis=True, kappa has a field for each axis" : "";
+  return shape_[0] == dim() - 1 ? "; with per_axis=True, kappa has a field for each axis; species are samples" : "";
 }
 
 void DiffusionOperator::check_vector(const at::Tensor& b) const {

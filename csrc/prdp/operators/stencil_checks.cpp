@@ -29,7 +29,7 @@ kernels::Offset offset_of(at::ArrayRef<double> cells) {
   }
   for (const int64_t along : offset.along)
     TORCH_CHECK_VALUE(std::abs(along) <= kFarthest, "Stencil: offsets reach at most ", kFarthest,
-                      " cells along each axis, got ", as_tuple(entries(offset, dim)));
+                      " cells along each axis, got ", as_tuple(entries(offset, dim)), "; Matrix.csr takes any");
   return offset;
 }
 

@@ -166,6 +166,11 @@ std::string breakdown(const FailedSample& sample) {
   if (maps_ones_to_zero(sample)) return "its preconditioner maps a vector of ones to zero; look at what M⁻¹ is made of";
   if (sample.method().counts == Counts::kIterations)
     return c10::str("r·A r is zero for a residual r, or u grew without end; take ", weaker_methods(sample));
+  if (is_singular(sample.role.a))
+    return c10::str(
+        "its space is exhausted and does not hold the solution: A has a null vector that was not named, or is "
+        "too ill-conditioned for ",
+        sample.precision(), "; take BiCGStab or Direct");
   const char* remedy = sample.is_single() ? "float32; take float64 to tell, or" : "float64; if it is singular, take";
   return c10::str(
       "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range, "
@@ -188,7 +193,7 @@ std::string stagnated(const FailedSample& sample) {
   const auto method = sample.solver().method;
   if (is_diffusion_in_single(sample)) return kMayBeRight;
   if (sample.method().counts == Counts::kCycles)
-    return c10::str("its cycles take nothing more off the residual; take a larger restart, ",
+    return c10::str("its cycles take nothing more off the residual; take a larger restart, BiCGStab, ",
                     multigrid ? "no multigrid" : "a preconditioner", ", or Direct", single ? ", or float64" : "",
                     if_singular());
   const char* another = method == Method::kDirect ? "take an iterative method"
@@ -205,14 +210,18 @@ std::string max_iter_reached(const FailedSample& sample) {
   if (auto found = unfit(sample); !found.empty()) return found;
   const bool single = sample.is_single();
   if (loses_coarse_grids(sample)) return kLostCoarseGrids;
-  if (is_diffusion_in_single(sample) && !sample.preconditioner().is_multigrid())
+  const bool were_many = sample.solver().max_iter.expect_int() >= 100;
+  if (were_many && is_diffusion_in_single(sample) && !sample.preconditioner().is_multigrid())
     return c10::str("more iterations may help, or ", kMayBeRight);
   if (sample.preconditioner().is_multigrid() && asymmetric(sample).empty())
     return "its cycles are slow where coefficients jump from cell to cell; take more iterations, \"diagonal\" or "
            "Direct";
   if (sample.preconditioner().is_multigrid())
-    return "its cycles may not be made for this A, as for a wind in central differences that is strong beside the "
-           "diffusion; take upwind differences, leave out multigrid, or take Direct";
+    return c10::str(
+        "its cycles may not be made for this A, as for a wind in central differences or species whose coupling is "
+        "strong "
+        "beside the diffusion; take upwind differences, ",
+        sample.method().counts == Counts::kCycles ? "BiCGStab, a larger restart, " : "", "no multigrid, or Direct");
   if (sample.method().is_direct)
     return c10::str("its residual is above the rounding of a product, though u may be right; ",
                     single ? "solve it in float64 once to see" : "scale A and b",

@@ -116,15 +116,15 @@ Solver to_go_on(const Look& look, const SolveInfo& info) {
   return solver;
 }
 
-/// How far u changes, as a share of its largest entry, by a solve for its error. Where the rounding of A itself moves u
-/// as far, as along a null vector that nobody named, that says nothing: 0.
+/// How far u changes by a solve for its error, as a share of its largest entry then. Where the rounding of A itself
+/// moves u as far, as along a null vector that nobody named, that says nothing: 0.
 at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const SolveInfo& info) {
   const auto solver = to_go_on(look, info);
-  const auto u = look.u.to(at::kDouble), size = per_sample(sample_maxima(u), u);
+  const auto u = look.u.to(at::kDouble);
   const auto exact = make_operator(in_double(look.role.a, 0.0));
   const auto change_by = [&](const Operator& of, const at::Tensor& part_of_b) {
-    const auto change = solve(of, of.project(part_of_b), {.solver = solver}).u;
-    return (change.to(at::kDouble).abs() / size).nan_to_num(0.0, 0.0, 0.0);
+    const auto change = solve(of, of.project(part_of_b), {.solver = solver}).u.to(at::kDouble);
+    return (change.abs() / per_sample(sample_maxima(u + change), u)).nan_to_num(0.0, 0.0, 0.0);
   };
   const auto product = apply_on_loops(*exact, u, /*transposed=*/false);
   auto changes = change_by(a, (look.b.to(at::kDouble) - product).to(look.b.scalar_type()));
@@ -157,8 +157,11 @@ void warn_of_small_rows(const Look& look, const Operator& a, const SolveInfo& in
     const auto place = shares[i].eq(worst);
     text << look.beginning(i) << (adjoint ? "its solution, which the gradient is made of," : "u")
          << " is off by at least about " << three_digits(100.0 * worst) << " % of its largest entry at index "
-         << as_tuple(first_true(place))
-         << ": some rows of A, such as those of a penalty or where a coefficient is large, are up to "
+         << as_tuple(first_true(place));
+    if (const auto others = worst_of.gt(look.much()).sum().item<int64_t>() - 1; others > 0)
+      text << " (and those of " << others << " other sample" << (others > 1 ? "s" : "") << " by more than "
+           << three_digits(100.0 * look.much()) << " %)";
+    text << ": some rows of A, such as those of a penalty or where a coefficient is large, are up to "
          << three_digits(spread) << " times as large as others, and a residual beside them tells little of these. Take "
          << in_language("Direct()", "Direct{}");
     const double enough = rtol * (rtol / worst);  // the error falls with rtol, here to about rtol
