@@ -95,7 +95,7 @@ class DenseFactors final : public Factors<T> {
       for (size_t k = 0; k < right.size(); ++k) m += size * vector(left[k]) * vector(right[k]).transpose();
       return std::make_shared<DenseLU>(m);
     };
-    constexpr int64_t worth_keeping = 8;  // unknowns: the key of a smaller matrix takes as long as its factors
+    constexpr int64_t worth_keeping = 16;  // unknowns: the key of a smaller matrix takes as long as its factors
     if (a.null_space() || n_ < worth_keeping) lu_ = make();
     else lu_ = factor_cache::find_or_make<DenseLU>(FactorKeyMaker().add(n_).add(a.values(), n_ * n_).key(), make);
   }
