@@ -249,7 +249,8 @@ class Flow(HoldsTensors, Stepper):
         walls = flow_walls.vectors(moving, d) if moving else []
         boundary, length = _of_axes("boundary", self.boundary, d), _of_axes("length", self.length, d)
         if not all(isinstance(name, str) for name in boundary):
-            raise TypeError(f"Flow: boundary must be a name or one per axis, got {self.boundary!r}")
+            names = '"periodic", "wall", "slip" or "open"'
+            raise TypeError(f"Flow: boundary must be {names}, or one of them per axis, got {self.boundary!r}")
         sides = tuple(_check.real("Flow", "length", side) for side in length)
         box = self._kept_box.of(tuple(self.shape), boundary, sides, _Mask(self.obstacle))
         return _C.FlowEquation(box, dt, nu, force, inflow, walls, self.advection, self.diffusion, self.pressure_form)

@@ -26,7 +26,7 @@ BAD = {
         ValueError,
         "boundary must be one for all axes or one per axis, 2 here",
     ),
-    "no name": ({"boundary": 3}, TypeError, "boundary must be a name or one per axis"),
+    "no name": ({"boundary": 3}, TypeError, 'boundary must be "periodic", "wall", "slip" or "open", or one'),
     "length": ({"length": (1.0, 0.0)}, ValueError, "length must be finite and > 0, got 0"),
     "dt": ({"dt": 0.0}, ValueError, "dt must be finite and > 0, got 0"),
     "nu": ({"nu": -1.0}, ValueError, "nu must be finite and >= 0, got -1"),
