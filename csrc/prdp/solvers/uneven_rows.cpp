@@ -123,11 +123,11 @@ at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const
   const auto u = look.u.to(at::kDouble);
   const auto exact = make_operator(in_double(look.role.a, 0.0));
   const auto change_by = [&](const Operator& of, const at::Tensor& part_of_b) {
-    const auto change = solve(of, of.project(part_of_b), {.solver = solver}).u.to(at::kDouble);
-    return (change.abs() / per_sample(sample_maxima(u + change), u)).nan_to_num(0.0, 0.0, 0.0);
+    return solve(of, of.project(part_of_b), {.solver = solver}).u.to(at::kDouble);
   };
   const auto product = apply_on_loops(*exact, u, /*transposed=*/false);
-  auto changes = change_by(a, (look.b.to(at::kDouble) - product).to(look.b.scalar_type()));
+  const auto change = change_by(a, (look.b.to(at::kDouble) - product).to(look.b.scalar_type()));
+  auto changes = (change.abs() / per_sample(sample_maxima(u + change), u)).nan_to_num(0.0, 0.0, 0.0);
   if (!(changes.max() > look.much()).item<bool>()) return changes;
   const bool keeps_null_space = look.role.a.kind == "singular_diffusion";  // the constant, whatever κ
   auto is_free = keeps_null_space ? at::zeros({u.size(0)}, at::kBool)
@@ -135,7 +135,7 @@ at::Tensor changes_by_more_iterations(const Look& look, const Operator& a, const
   if (keeps_null_space || !is_singular(look.role.a)) {
     const auto rounded = make_operator(in_double(look.role.a, epsilon_of(look.b)));
     const auto moved = change_by(*exact, apply_on_loops(*rounded, u, /*transposed=*/false) - product);
-    is_free = is_free.logical_or(sample_maxima(moved) > 0.3 * sample_maxima(changes));
+    is_free = is_free.logical_or(sample_maxima(moved) > 0.3 * sample_maxima(change));
   }
   return changes.masked_fill(per_sample(is_free, u), 0.0);
 }
