@@ -49,7 +49,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   Vector b() const { return b_; }
   Scalar b2() const { return b2_; }
   int64_t unknowns() const { return values_.unknowns(); }
-  double epsilon() const { return values_.epsilon(); }
+  double unit_roundoff() const { return values_.unit_roundoff(); }
   template <class X>
   std::vector<X> array(int64_t n) const {
     return std::vector<X>(n);

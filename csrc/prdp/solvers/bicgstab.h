@@ -80,7 +80,7 @@ class BiCGStabMethod {
   /// ρ = r̂·r; where that is rounding, it starts anew with ρ = r·r.
   Scalar rho_or_anew() {
     Scalar rho = space_.dot(hat_, r_);
-    const Scalar lost = space_.is_rounding(rho, hat2_, r2_, 200 * space_.epsilon());
+    const Scalar lost = space_.is_rounding(rho, hat2_, r2_, 200 * space_.unit_roundoff());
     start_anew_where(lost);
     space_.restore(lost, r2_, rho);
     return rho;

@@ -78,7 +78,7 @@ void accept_by_energy(Space& space, Method& method, typename Space::States& stat
       continue;
     }
     s.returned = Returned::kLast;
-    if (!energy_falls(products[i], space.epsilon(), definite[i])) s.status = SolveStatus::kDiverged;
+    if (!energy_falls(products[i], space.unit_roundoff(), definite[i])) s.status = SolveStatus::kDiverged;
   }
 }
 

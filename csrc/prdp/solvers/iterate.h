@@ -118,7 +118,8 @@ void accept_if_insensitive(Space& space, const Method& method, typename Space::S
   constexpr double stays = 1e-3;  // far below 1, as the estimate may be too small
   const auto u2 = space.values_of(space.solution2(method.x)), moved2 = space.values_of(space.skeel_estimate2(method.x));
   for (size_t i = 0; i < states.size(); ++i)
-    if (states[i].returned == Returned::kZero && space.epsilon() * std::sqrt(moved2[i]) < stays * std::sqrt(u2[i]))
+    if (states[i].returned == Returned::kZero &&
+        space.unit_roundoff() * std::sqrt(moved2[i]) < stays * std::sqrt(u2[i]))
       accept_rounding(states[i]);
 }
 
@@ -158,7 +159,7 @@ inline constexpr bool kMayGrow = kMayExhaust<Method> || (kHasRecursiveResidual<M
 template <class Space, class Method>
 auto have_grown(Space& space, const Method& method, const typename Space::States& states) {
   auto grown = space.map(states, [](const SampleState&) { return false; });
-  if (space.epsilon() > 1e-10) return grown;
+  if (space.unit_roundoff() > 1e-10) return grown;
   const auto floors = rounding_floors(space, method);
   const auto definite = space.surely_definite();
   // In a badly conditioned system a method other than GMRES may still be on its way: its bound is 100 times as large.
@@ -172,7 +173,7 @@ auto have_grown(Space& space, const Method& method, const typename Space::States
   if (!any) return grown;
   const auto rounding2 = space.values_of(space.componentwise_scale2(method.x, /*attempt=*/0));
   for (size_t i = 0; i < states.size(); ++i)
-    grown[i] = grown[i] && space.epsilon() * std::sqrt(rounding2[i]) > 0.1 * bound * std::sqrt(states[i].b2);
+    grown[i] = grown[i] && space.unit_roundoff() * std::sqrt(rounding2[i]) > 0.1 * bound * std::sqrt(states[i].b2);
   return grown;
 }
 
@@ -215,7 +216,8 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
   for (auto& s : states) {
     const bool may_be_worse = is_unsolved(s.status) || s.status == SolveStatus::kBreakdown;
     const bool is_lost = track && has_lost_residual<Method>(space, s);
-    s.returned = is_lost || (may_be_worse && is_above_b(s, space.epsilon())) ? Returned::kBestOrZero : Returned::kLast;
+    s.returned =
+        is_lost || (may_be_worse && is_above_b(s, space.unit_roundoff())) ? Returned::kBestOrZero : Returned::kLast;
   }
   accept_at_rounding_floor(space, method, states);
   if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states, track);
@@ -253,7 +255,7 @@ template <class Space, class Method>
 void take_least_of_halves(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   const auto is_lost = [&](const SampleState& s) { return track && has_lost_residual<Method>(space, s); };
   const auto is_worse = [&](const SampleState& s) {
-    return s.returned == Returned::kBestOrZero && (is_lost(s) || is_above_b(s, space.epsilon()));
+    return s.returned == Returned::kBestOrZero && (is_lost(s) || is_above_b(s, space.unit_roundoff()));
   };
   if (std::none_of(states.begin(), states.end(), is_worse)) return;
   const auto full_run = states;

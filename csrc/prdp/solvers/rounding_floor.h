@@ -14,14 +14,14 @@ template <class Space, class Method>
 auto rounding_floors(Space& space, const Method& method) {
   const auto norm_a = space.operator_norm();
   auto floors = space.values_of(space.solution2(method.x));
-  for (size_t i = 0; i < floors.size(); ++i) floors[i] = space.epsilon() * norm_a[i] * std::sqrt(floors[i]);
+  for (size_t i = 0; i < floors.size(); ++i) floors[i] = space.unit_roundoff() * norm_a[i] * std::sqrt(floors[i]);
   return floors;
 }
 
 /// A floor beyond this share of ‖b‖ means that u has grown along a null vector that nobody named, or nearly one.
 template <class Space>
 double largest_floor(const Space& space) {
-  return space.epsilon() < 1e-10 ? 1e-5 : 0.25;
+  return space.unit_roundoff() < 1e-10 ? 1e-5 : 0.25;
 }
 
 /// Sweeps or cycles without progress for so long may be at their rounding, which takes a closer look.
@@ -100,7 +100,7 @@ PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, ty
     const auto componentwise_scale2 = space.values_of(space.componentwise_scale2(method.x, attempt));
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
-      const double floor = suspected[i], rounding = space.epsilon() * std::sqrt(componentwise_scale2[i]);
+      const double floor = suspected[i], rounding = space.unit_roundoff() * std::sqrt(componentwise_scale2[i]);
       if (!(floor > 0.0)) continue;
       const bool is_rounding = residual_is_rounding<Method>(s, rtol, floor, rounding, attempt);
       if (is_rounding || s.on_its_way) suspected[i] = 0.0;

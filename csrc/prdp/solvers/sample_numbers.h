@@ -31,7 +31,7 @@ class SampleNumbers {
   using Scalar = T;
   using States = std::array<SampleState, 1>;
 
-  static constexpr double epsilon() { return std::numeric_limits<T>::epsilon() / 2; }
+  static constexpr double unit_roundoff() { return std::numeric_limits<T>::epsilon() / 2; }
   void assign(Scalar from, Scalar& to) { to = from; }
   static Scalar sum_of_squares(Scalar v2, Scalar a, Scalar w2) { return v2 + a * a * w2; }
 

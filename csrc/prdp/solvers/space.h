@@ -47,7 +47,7 @@ concept Primitives =
       /// Entries of a vector; the unit roundoff. It is ε in skeel_estimate2() and in the loop around the methods, and
       /// ε/2 in guarded_quotient(), breaks_down() and damp().
       { s.unknowns() } -> std::same_as<int64_t>;
-      { s.epsilon() } -> std::same_as<double>;
+      { s.unit_roundoff() } -> std::same_as<double>;
 
       /// x = 0, of frozen samples too.
       s.fill_zero(x);

@@ -39,7 +39,7 @@ void start_from(Space& space, const typename Space::Scalar* x0) {
     bool better = left2 < b2 && std::isfinite(space.largest_magnitude(x));
     if (better && left2 > b2 / 4)  // less is no rounding's doing
       better = start_gains_more_than_rounding<double>(
-          b2, left2, space.epsilon() * space.operator_norm()[0] * std::sqrt(space.dot(x, x)));
+          b2, left2, space.unit_roundoff() * space.operator_norm()[0] * std::sqrt(space.dot(x, x)));
     if (better) space.shift_to_start(left2);
   }
   space.fill_zero(product);

@@ -24,7 +24,7 @@ TensorGmres::TensorGmres(TensorSpace& space, int64_t restart)
     : x(space.vector()),
       space_(space),
       m_(std::min(restart, space.unknowns())),
-      numbers_{2 * space.epsilon(), space.negligible()} {}
+      numbers_{2 * space.unit_roundoff(), space.negligible()} {}
 
 void TensorGmres::start() {
   x = space_.vector();

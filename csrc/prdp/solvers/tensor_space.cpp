@@ -27,7 +27,7 @@ void TensorSpace::start_from(at::Tensor x, at::Tensor r) {
   b2_ = dot(b_, b_);
 }
 
-double TensorSpace::epsilon() const { return limits_of(b_).epsilon / 2; }
+double TensorSpace::unit_roundoff() const { return limits_of(b_).epsilon / 2; }
 
 const at::Tensor& TensorSpace::diagonal() {
   if (!diagonal_.defined()) {

@@ -52,7 +52,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   const Vector& b() const { return b_; }
   const Scalar& b2() const { return b2_; }
   int64_t unknowns() const { return b_.numel() / std::max<int64_t>(b_.size(0), 1); }
-  double epsilon() const;
+  double unit_roundoff() const;
   template <class X>
   std::vector<X> array(int64_t n) const {
     return std::vector<X>(n);
